@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams stop release licences pictures
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs fuzz soak setup clean requirements docs diagrams stop release licences pictures
 
 run: setup
 	$(BIN)/python launch.py
@@ -57,21 +57,15 @@ ros-wheels: .venv-ros/installed
 	.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r $<
 	@touch $@
 
-# Hits every process of the full system in every way, 50 routers in one mission, then 200 deaths in
-# ten minutes with a count of what leaks; half an hour. First the same for control nodes over many
-# seeds in virtual time.
+# Hits every process of the full system in every way in one mission, then 50 routers, with a count of
+# what leaks; a quarter of an hour.
 chaos: setup
-	$(BIN)/python -m tests.whole.checkpoint_runs 0 10 6
-	$(BIN)/python -m tests.whole.chaos_runs
+	$(BIN)/python -m tests.whole.chaos_runs ways
 
 # Hits every pair of processes of the full system, one after the other in long missions; an hour or
 # more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
 chaos-pairs: setup
 	$(BIN)/python -m tests.whole.chaos_runs pairs
-
-# Missions that have an overload of the machine on the way, 20 of each kind; an hour and a half.
-overload: setup
-	$(BIN)/python -m tests.whole.overload_runs
 
 # Missions without end, a random fault every five seconds, for so many hours; figures at the end.
 # Interrupted, it goes on where it was: the same command.

@@ -3,8 +3,8 @@
 A plan is pure and seeded: which processes are hit, how, and how long after the strike before.
 `Chaos` carries strikes out one by one, and waits each time until every victim is gone and another
 process has taken its place. If asked, it also waits until the whole system is back: the
-supervisor's table has all nodes running in the processes that /proc shows, and each of them has
-posted a heartbeat since. So nothing depends on the supervisor's word alone.
+supervisor's table has all nodes running in the processes that /proc shows, with a heartbeat since
+the repair.
 
 Two processes are only stopped for a moment (`PAUSE`):
 
@@ -16,37 +16,31 @@ A process of the pool is no node: any other one of the pool counts as its replac
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
+import json
 import os
 import random
 import re
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.bus.envelope import decode
-from rampart.actors.bus.run_folder import ROUTERS, board_of
-from rampart.actors.bus.topics import HEARTBEAT
-from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import NodeState, NodeTable
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
-from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_file import read
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.root import POOL
-from rampart.cli.output import UsageError
-from rampart.cli.session import connect
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.testing import RealRun
+from tests.real_tools import printed
 
 ROOT_PROCESS = "root"
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
@@ -63,8 +57,6 @@ GAP_S = 0.4
 """The second of a pair is hit at once, or up to so many wall seconds later."""
 
 EMERGENCY_STOP = "RM1"
-_LISTEN_S = 1.5
-"""A session listens for so long: it does not see who comes back later."""
 
 _ENDED = re.compile(r"\] mission \S+ (succeeded|failed|cancelled)")
 _DECISION = re.compile(r"\] decision \d+: (.*)")
@@ -137,18 +129,6 @@ def each_in_every_way(of: Targets, seed: int, after_s: tuple[float, float]) -> l
     return strikes
 
 
-def so_many(names: Sequence[str], count: int, seed: int, after_s: tuple[float, float]
-            ) -> list[Strike]:
-    """Return `count` strikes of random processes, none twice in succession, in random ways."""
-    dice = random.Random(f"chaos {seed}")
-    strikes: list[Strike] = []
-    for _ in range(count):
-        others = [name for name in names if not strikes or (name,) != strikes[-1].names]
-        strikes.append(Strike((Hit(dice.choice(others), dice.choice(WAYS)),),
-                              dice.uniform(*after_s)))
-    return strikes
-
-
 def every_pair(of: Targets, seed: int) -> list[Strike]:
     """Return every pair of a system's processes in a drawn order, each killed, stopped or hung.
 
@@ -178,25 +158,19 @@ class Struck:
 
     Attributes:
         strike: The strike.
-        replaced_s: Wall seconds from the first signal until every victim was replaced.
-        back_s: And until everything was back that was asked for; None if it was not in time.
-        others: Processes that were replaced besides.
+        back_s: Wall seconds from the first signal until all was back that was asked for; None if
+            it was not in time.
         missing: What was not back.
-        story: What the run printed meanwhile, if something was not back.
     """
 
     strike: Strike
-    replaced_s: float | None
     back_s: float | None
-    others: tuple[str, ...] = ()
     missing: str = ""
-    story: str = ""
 
     def __str__(self) -> str:
         back = f"NOT BACK: {self.missing}" if self.back_s is None else (
             f"back in {self.back_s * 1e3:5.0f} ms")
-        return f"{self.strike}  {back}" + (
-            f", {', '.join(self.others)} as well" if self.others else "")
+        return f"{self.strike}  {back}"
 
 
 class Chaos:
@@ -209,19 +183,16 @@ class Chaos:
     Attributes:
         struck: What was carried out.
         resets: Emergency stops that were released.
-        is_unsafe: Whether the run reported something unsafe.
     """
 
     def __init__(self, run: RealRun, report: Callable[[Struck], object] = lambda _: None) -> None:
         self.struck: list[Struck] = []
         self.resets = 0
-        self.is_unsafe = False
         self._run = run
         self._report = report
         info = run.info
         self._rate = info.rate
         self._clock = Clock(info.origin_s, info.rate)
-        self._board = board_of(info.folder)
         self._read = 0
         self._has_ended = False
         self._decided = ""
@@ -244,33 +215,25 @@ class Chaos:
             strike: What is hit.
             everything: Whether the whole system has to be back, and not only the victims.
         """
-        read, before = self._read, self._pids()
-        deadline = time.monotonic() + BACK_WITHIN_S
-        while absent := [name for name in strike.names if name not in before]:
-            if self.over():
-                return None
-            if time.monotonic() > deadline:
-                return self._note(Struck(strike, None, None, (), f"{', '.join(absent)}: not there",
-                                         self._run.story_from(read)))
-            before = self._pids()
         begun_s = time.monotonic()
-        self._send(strike, before)
-        replaced_s = None
-        while time.monotonic() < begun_s + BACK_WITHIN_S * len(strike.hits):
+        deadline = begun_s + BACK_WITHIN_S * len(strike.hits)
+        before: dict[str, int] = {}
+        missing = "a victim"
+        while time.monotonic() < deadline:
             if self.over():
                 return None
-            missing = ", ".join(hit.name for hit in strike.hits
-                                if not self._is_replaced(hit, before[hit.name]))
-            if missing:
-                time.sleep(0.005)
-                continue
-            replaced_s = replaced_s or time.monotonic() - begun_s
-            missing = asyncio.run(self._missing()) if everything else ""
-            if not missing:
-                return self._note(Struck(strike, replaced_s, time.monotonic() - begun_s,
-                                         self._others(strike, before) if everything else ()))
-        return self._note(Struck(strike, replaced_s, None, self._others(strike, before), missing,
-                                 self._run.story_from(read)))
+            if not before:
+                there = self._pids()
+                if set(strike.names) <= there.keys():
+                    before, begun_s = there, time.monotonic()
+                    self._send(strike, before)
+            elif not (missing := ", ".join(hit.name for hit in strike.hits
+                                           if not self._is_replaced(hit, before[hit.name]))):
+                missing = self._missing() if everything else ""
+                if not missing:
+                    return self._note(Struck(strike, time.monotonic() - begun_s))
+            time.sleep(0.005)
+        return self._note(Struck(strike, None, missing))
 
     def over(self) -> bool:
         """Return whether the mission has ended, or the run."""
@@ -278,7 +241,6 @@ class Chaos:
         whole = new[:new.rfind("\n") + 1]
         self._read += len(whole.encode())
         self._has_ended = self._has_ended or _ENDED.search(whole) is not None
-        self.is_unsafe = self.is_unsafe or "UNSAFE" in whole
         for decision in _DECISION.finditer(whole):
             self._decided = decision[1]
         return self._has_ended or self._run.process.poll() is not None
@@ -321,92 +283,45 @@ class Chaos:
             return new == old and process_state(old) in "SRD"
         return new not in {None, old} and process_state(old) in "XZ"
 
-    def _others(self, strike: Strike, before: dict[str, int]) -> tuple[str, ...]:
-        after = self._pids()
-        return tuple(sorted(name for name, pid in before.items()
-                            if name not in strike.names and after.get(name) != pid))
-
-    async def _missing(self) -> str:
+    def _missing(self) -> str:
         """Return what is not as it has to be, "" if all nodes run and sent a heartbeat just now."""
-        tables: list[NodeTable] = []
         since_s = self._clock.now()
-        missing = "no table from the supervisor"
-        try:
-            async with connect(self._run.port) as session:
-                session.listen(topics.NODES, lambda _key, _header, table: tables.append(table))
-                deadline = time.monotonic() + session.real_s(_LISTEN_S)
-                while missing and time.monotonic() < deadline and not self.over():
-                    await asyncio.sleep(0.02)
-                    if tables:
-                        missing = self._compared(tables[-1], since_s)
-        except UsageError as error:  # the root does not answer
-            await asyncio.sleep(0.1)
-            return str(error)
-        return missing
-
-    def _compared(self, table: NodeTable, since_s: float) -> str:
+        table = json.loads(printed(self._run, "node", "list", "--json") or "[]")
         there = self._pids()
-        wrong = [f"{row.name} {row.state.value}" for row in table.nodes
-                 if row.state is not NodeState.RUNNING]
-        wrong += [f"{row.name} has another pid" for row in table.nodes
-                  if there.get(row.name) != row.pid]
-        wrong += [f"{row.name} sends no heartbeat" for row in table.nodes
-                  if self._beat_of(row.name, since_s) != row.pid]
-        return ", ".join(wrong)
-
-    def _beat_of(self, node: str, since_s: float) -> int | None:
-        """Return the pid in a node's posted heartbeat; None if it is older than `since_s`."""
-        posted = self._board.read(HEARTBEAT.at(node))
-        if posted is None:
-            return None
-        header, beat = decode(HEARTBEAT, posted)
-        return beat.pid if header.stamp >= since_s else None
+        return ", ".join(
+            f"{row['name']} {row['state']}, pid {row['pid']} for {there.get(row['name'])}"
+            for row in table if row["state"] != "running" or row["pid"] != there.get(row["name"])
+            or row["heard_s"] < since_s - 1.0) if table else "no table from the supervisor"
 
 
-def complaints(run: RealRun, code: int, result: dict[str, Any], lights: tuple[str, ...],
-               struck: Sequence[Struck]) -> list[str]:
+def complaints(code: int, result: Mapping[str, Any], story: str, lights: tuple[str, ...] = ("",),
+               ) -> list[str]:
     """Return what is wrong with a run that has ended; empty if all is as it has to be.
 
+    Three records of lights are compared: the result, and both nodes' checkpoints. A light that was
+    measured twice has two intensities, and one of the three has the other one.
+
     Args:
-        run: The run.
-        code: Exit code of `launch.py`.
+        code: Its exit code.
         result: What it printed with --json.
+        story: And on stderr.
         lights: How the names of the lights begin that the mission passes.
-        struck: What was done to it.
     """
-    wrong = [f"not back: {done}" for done in struck if done.back_s is None]
-    if (code, result["mission"], result["safety"]) != (0, "success", "safe"):
-        wrong.append(f"exit code {code}, {result['mission']}, {result['safety']}: "
-                     + "; ".join(result["reasons"]))
-    wrong += [f"left over: {p}" for p in find_processes(run.port)]
-    wrong += [f"printed: {line}" for line in run.story.splitlines()
-              if "UNSAFE" in line or "given up" in line]
-    if result["mission"] == "success":  # else lights are missing
-        wrong += _lights_wrong(Path(result["report"]).parent, result, lights)
+    if (code, result.get("mission"), result.get("safety")) != (0, "success", "safe"):
+        return [f"exit code {code}, {result}"]  # and lights are missing
+    wrong = [f"printed: {line}" for line in story.splitlines()
+             if "UNSAFE" in line or "given up" in line]
+    report = Path(result["report"])
+    run_id = report.stem.removeprefix("inspection-")
+    reported = {one["name"]: one["intensity_cd"] for one in result["lights"]
+                if one["verdict"] != "not measured"}
+    expected = {one["name"] for one in result["lights"] if one["name"].startswith(lights)}
+    if reported.keys() != expected:
+        wrong.append(f"lights: {sorted(reported)}, not {sorted(expected)}")
+    for node, form in (("mission_manager", MISSION_STATE), ("osmosis_control", CONTROL_STATE)):
+        newest = read(report.parent / "checkpoints", node, run_id).records[0]
+        state: Any = form.decode(newest.version, newest.state)
+        kept = state.lights if node == "mission_manager" else state.lights.measured
+        if sorted((x.light, x.intensity_cd) for x in kept) != sorted(reported.items()):
+            wrong.append(f"lights of {node}: {kept}, not {reported}")
     return wrong
-
-
-def _lights_wrong(report: Path, result: dict[str, Any], passed: tuple[str, ...]) -> list[str]:
-    """Compare the three records of lights: the result, and both nodes' checkpoints.
-
-    A light that was measured twice has two intensities, and one of the three has the other one.
-    """
-    expected = sorted(x["name"] for x in result["lights"] if x["name"].startswith(passed))
-    run_id = Path(result["report"]).stem.removeprefix("inspection-")
-    state = _newest(report / "checkpoints", "mission_manager", run_id, MISSION_STATE)
-    kept = _newest(report / "checkpoints", "osmosis_control", run_id, CONTROL_STATE)
-    reported = {x["name"]: x["intensity_cd"] for x in result["lights"]
-                if x["verdict"] != "not measured"}
-    wrong = []
-    for node, lights in (("mission_manager", state.lights),
-                         ("osmosis_control", kept.lights.measured)):
-        if sorted(x.light for x in lights) != expected:
-            wrong.append(f"lights of {node}: {sorted(x.light for x in lights)}, not {expected}")
-        if {x.light: x.intensity_cd for x in lights} != reported:
-            wrong.append(f"lights of {node} have other values than the result's")
-    return wrong
-
-
-def _newest(folder: Path, node: str, run_id: str, form: StateFormat[Any]) -> Any:
-    record = read(folder, node, run_id).records[0]
-    return form.decode(record.version, record.state)

@@ -17,8 +17,6 @@ import pytest
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 
-_MEMORY = Path("/sys/fs/cgroup/memory")
-
 
 class OwnClock:
     """A time of day for a run alone, which may jump."""
@@ -90,35 +88,6 @@ def no_descriptor_left(run: RealRun) -> Iterator[None]:
         for pid, limits in before.items():
             if psutil.pid_exists(pid):
                 resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
-
-
-@contextmanager
-def little_memory(run: RealRun, more_mb: int) -> Iterator[Path]:
-    """Leave the processes of a run, and who joins its group, so much more memory together."""
-    group = _MEMORY / f"rampart-test-{os.getpid()}"
-    try:
-        group.mkdir()
-    except OSError as error:
-        pytest.skip(f"no memory cgroup may be made here: {error}")
-    home = _MEMORY / _group_of(os.getpid())
-    try:
-        # What is there is not charged to the new group: it counts what is asked for from now on.
-        (group / "memory.limit_in_bytes").write_text(str(more_mb << 20))
-        for process in processes(run).values():
-            (group / "cgroup.procs").write_text(str(process.pid))
-        yield group
-    finally:
-        for pid in (group / "cgroup.procs").read_text().split():
-            (home / "cgroup.procs").write_text(pid)
-        group.rmdir()
-
-
-def _group_of(pid: int) -> str:
-    for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
-        _, controllers, path = line.split(":", 2)
-        if "memory" in controllers.split(","):
-            return path.lstrip("/")
-    return ""
 
 
 @contextmanager

@@ -8,60 +8,65 @@ and after that step it counts whether memory grows. Then half of the faults hit 
 outside. The other half are those of messages, sensors, actuators and the world that the run's
 injector knows; each is over when the next one comes. An emergency stop that latches is reset.
 
-Faults and how soon each was detected and over, missions and their verdicts, and every ten seconds
-what each process uses are kept as lines of JSON: an interrupted soak continues with the same
-command until it has lasted HOURS. At the end, and with --summary alone, figures are printed. A
-mission that fails and is safe is counted. One that is not safe ends the soak; its report is kept.
-Exit code 1 if anything was unsafe, not brought back, or grows.
+Faults, missions and their verdicts, and every ten seconds what each process uses are kept as lines
+of JSON: an interrupted soak continues with the same command until it has lasted HOURS. At the end
+figures are printed. A mission that fails and is safe is counted. One that is not safe ends the
+soak; its report is kept. Exit code 1 if anything was unsafe, not brought back, or grows.
+
+A figure grows if the line through it rises by more per hour than what counts, and what it rises by
+is more than chance (a correlation above `CLEAR`). Samples of one mission have a level of their own,
+so each is compared with the mean of its mission. The first five minutes of a mission are left out:
+processes begin as copies of the root, and what they share with it becomes their own as they touch
+it.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import random
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import psutil
 
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.supervision.process_title import find_processes
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.testing import RealRun
 from tests.whole.chaos import ROOT_PROCESS, Chaos, Hit, Strike, Struck, targets
-from tests.whole.chaos_runs import Log, load, say, start, write_laps
-from tests.whole.soak_summary import summary, wrong
+from tests.whole.chaos_runs import Log, Record, load, say, spread, start, write_laps
 
 EVERY_S, FIRST_S = 5.0, 10.0
 """Simulated seconds between two faults of a mission, and before the first one."""
 
 LASTS_S = (0.5, 4.0)
 SAMPLE_S = 10.0
+WARM_UP_S = 300.0
 END_WITHIN_S = 60.0
 LONGEST_S = 3600.0
 """Simulated seconds of a mission for which faults are planned."""
 
+FIGURES = ("MB of its own", "descriptors", "threads")
+ALL = "all"
+COUNTS = {ALL: (30.0, 60.0, 20.0), ROOT_PROCESS: (15.0, 6.0, 2.0)}
+ONE = (5.0, 6.0, 2.0)
+"""How much in an hour counts: of all together, of the root, and of any other process."""
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """Faults of one mission: hits of processes by simulated second, and faults of its injector."""
-
-    hits: tuple[tuple[float, Hit], ...]
-    faults: tuple[PlannedFault, ...]
+CLEAR = 0.5
 
 
-def plan(spec: SystemSpec, seed: int, mission: int) -> Plan:
-    """Return the faults of a mission, counted from 0."""
+def plan(spec: SystemSpec, seed: int, mission: int
+         ) -> tuple[list[tuple[float, Hit]], list[PlannedFault]]:
+    """Return hits of processes by simulated second, and faults of the injector, of a mission."""
     dice = random.Random(f"soak {seed} {mission}")
     of = targets(spec)
     groups = {kind: names for kind, names in fault_groups(spec).items()
@@ -78,7 +83,7 @@ def plan(spec: SystemSpec, seed: int, mission: int) -> Plan:
             names = groups[dice.choice(list(groups))]
             faults.append(PlannedFault(dice.choice(names), at_s,
                                        duration_s=round(dice.uniform(*LASTS_S), 2)))
-    return Plan(tuple(hits), tuple(faults))
+    return hits, faults
 
 
 def lasted_s(log: Log) -> float:
@@ -86,126 +91,118 @@ def lasted_s(log: Log) -> float:
     return max((r["at_s"] for r in log.records if "at_s" in r), default=0.0)
 
 
-class Mission:
-    """One mission of a soak: hits its processes and samples what they use."""
-
-    def __init__(self, run: RealRun, log: Log, number: int, planned: Plan) -> None:
-        self._run = run
-        self._log = log
-        self._number = number
-        self._due = list(planned.hits)
-        self._zero_s = time.monotonic() - lasted_s(log)
-        self.chaos = Chaos(run, self._hit)
-        self._info = run.info
-        self._hit_s = 0.0
-
-    def through(self, until_s: float) -> bool:
-        """Hit and sample until it is over; return whether the soak's time was up first."""
-        sampled_s = 0.0
-        while not self.chaos.over():
-            if self._due and self._into_s() >= self._due[0][0]:
-                self.chaos.release()
-                self._hit_s = self._into_s()
-                self.chaos.strike(Strike((self._due.pop(0)[1],)))
-            if self._into_s() > EVERY_S and time.monotonic() - sampled_s >= SAMPLE_S:
-                sampled_s = time.monotonic()
-                self._log.add("sample", at_s=self.at_s(), mission=self._number,
-                              into_s=round(self._into_s() / self._info.rate, 2),
-                              used=self._usage())
-            if self.at_s() >= until_s or self.chaos.is_unsafe:
-                return True
-            time.sleep(0.1)
-        return False
-
-    def at_s(self) -> float:
-        """Wall seconds of the soak."""
-        return round(time.monotonic() - self._zero_s, 3)
-
-    def _into_s(self) -> float:
-        return (time.monotonic() - self._info.origin_s) * self._info.rate
-
-    def _hit(self, struck: Struck) -> None:
-        hit, = struck.strike.hits
-        self._log.add("hit", at_s=self.at_s(), mission=self._number, into_s=round(self._hit_s, 3),
-                      name=hit.name, way=hit.way, back_s=struck.back_s)
-
-    def _usage(self) -> dict[str, tuple[int, int, int, int]]:
-        """Return each process's own memory and its share (kB), descriptors and threads."""
-        used = {}
-        for name, pid in {ROOT_PROCESS: self._run.process.pid, **{
-                p.names[0]: p.pid for p in find_processes(self._run.port)}}.items():
-            try:
-                process = psutil.Process(pid)
-                memory = process.memory_full_info()
-                used[name] = (memory.uss // 1024, memory.pss // 1024, process.num_fds(),
-                              process.num_threads())
-            except psutil.Error:
-                continue  # it has just ended
-        return used
+def usage(run: RealRun) -> dict[str, tuple[float, int, int]]:
+    """Return each process's `FIGURES`."""
+    used = {}
+    for name, pid in {ROOT_PROCESS: run.process.pid, **{
+            p.names[0]: p.pid for p in find_processes(run.port)}}.items():
+        try:
+            process = psutil.Process(pid)
+            used[name] = (process.memory_full_info().uss / 1e6, process.num_fds(),
+                          process.num_threads())
+        except psutil.Error:
+            continue  # it has just ended
+    return used
 
 
 def one_mission(directory: Path, log: Log, options: argparse.Namespace) -> bool:
     """Carry out a mission; return whether it was safe. Its directory is kept if not."""
     number = len(log.of("begin"))
-    planned = plan(load(), options.seed, number)
-    faults = [word for fault in planned.faults for word in ("--fault", fault.text())]
-    log.add("begin", at_s=lasted_s(log), mission=number)
-    laps = write_laps(directory.parent, options.laps)
-    with start(directory, laps, options.rate, "--seed", str(options.seed + number), *faults) as run:
-        mission = Mission(run, log, number, planned)
-        was_cut = mission.through(3600 * options.hours)
+    hits, planned = plan(load(), options.seed, number)
+    faults = [word for fault in planned for word in ("--fault", fault.text())]
+    zero_s = time.monotonic() - lasted_s(log)
+
+    def keep(kind: str, **fields: object) -> None:
+        log.add(kind, at_s=round(time.monotonic() - zero_s, 3), mission=number, **fields)
+
+    def hit(struck: Struck) -> None:
+        name, way = struck.strike.hits[0].name, struck.strike.hits[0].way
+        keep("hit", name=name, way=way, back_s=struck.back_s)
+
+    keep("begin")
+    directory.mkdir(parents=True, exist_ok=True)
+    with start(directory / "run", write_laps(directory, options.laps), options.rate,
+               "--seed", str(options.seed + number), *faults) as run:
+        chaos, info, sampled_s, was_cut = Chaos(run, hit), run.info, 0.0, False
+        while not (was_cut or chaos.over()):
+            into_s = time.monotonic() - info.origin_s
+            if hits and into_s * info.rate >= hits[0][0]:
+                chaos.release()
+                chaos.strike(Strike((hits.pop(0)[1],)))
+            if into_s > EVERY_S and time.monotonic() - sampled_s >= SAMPLE_S:
+                sampled_s = time.monotonic()
+                keep("sample", into_s=round(into_s, 2), used=usage(run))
+            was_cut = time.monotonic() - zero_s >= 3600 * options.hours or "UNSAFE" in run.story
+            time.sleep(0.1)
         if was_cut:
             run.process.send_signal(signal.SIGTERM)
         try:
-            code, result = run.result(END_WITHIN_S)
+            _, result = run.result(END_WITHIN_S)
         except (AssertionError, subprocess.TimeoutExpired) as error:
-            code, result = -1, {"mission": "fail", "safety": "not known", "duration_s": 0.0,
-                                "reasons": [f"no verdict: {type(error).__name__}"]}
-        ended_s = mission.at_s()
-    _keep_latencies(log, number, result, planned)
-    is_safe = bool(result["safety"] == "safe")
-    kept = Path(options.file).with_suffix("") / f"mission-{number}"
-    if not is_safe:
-        shutil.copytree(directory, kept, dirs_exist_ok=True)
-    log.add("mission", at_s=ended_s, mission=number, verdict=result["mission"], cut=was_cut,
-            safety=result["safety"], code=code, reasons=result["reasons"],
-            duration_s=result["duration_s"], resets=mission.chaos.resets,
-            left=[str(process) for process in find_processes(run.port)],
-            kept="" if is_safe else str(kept))
+            result = {"mission": "fail", "safety": "not known", "reasons": [repr(error)]}
+    keep("mission", verdict=result["mission"], cut=was_cut, safety=result["safety"],
+         reasons=result["reasons"], resets=chaos.resets)
     say(f"mission {number}: {'cut' if was_cut else result['mission']}, {result['safety']}, "
-        f"{result['duration_s']:.0f} s, {mission.chaos.resets} resets; {ended_s / 60:.1f} min of "
-        "soak")
-    return is_safe
+        f"{chaos.resets} resets; {lasted_s(log) / 60:.1f} min of soak")
+    if result["safety"] == "safe":
+        shutil.rmtree(directory)
+    return bool(result["safety"] == "safe")
 
 
-def _keep_latencies(log: Log, number: int, result: dict[str, Any], planned: Plan) -> None:
-    """Keep how soon each fault was detected and over, from the record of the mission."""
-    try:
-        record = json.loads(Path(result["record"]).read_text(encoding="utf-8"))
-    except (KeyError, OSError, TypeError, ValueError):
-        return
+def rise(samples: Iterable[tuple[int, float, float]], counts: float) -> float:
+    """Return by how much a figure grows in an hour; 0 if that is no more than chance, or counts.
 
-    def keep(fault: str, at_s: float, found: Sequence[dict[str, Any]], **more: Any) -> None:
-        log.add("latency", mission=number, into_s=at_s, fault=fault, **more,
-                detected_s=found[0]["from_s"] - at_s if found else None,
-                over_s=max(b["to_s"] for b in found) - at_s if found else None)
-
-    bars = record["intervals"]
-    for hit in (hit for hit in log.of("hit") if hit["mission"] == number):
-        at_s = hit["into_s"]
-        found = [b for b in bars if b["lane"] == "down" and b["name"] == hit["name"]
-                 and at_s <= b["from_s"] <= at_s + EVERY_S]
-        if found:
-            keep(f"{hit['way']} {hit['name']}", at_s, found[:1])
-    for fault, outcome in zip(planned.faults, record["faults"], strict=False):
-        if (at_s := outcome["injected_s"]) is not None:
-            ends_s = at_s + (fault.duration_s or 0.0) + 1.0
-            keep(fault.fault, at_s, [b for b in bars if b["lane"] == "detection"
-                                     and at_s <= b["from_s"] <= ends_s],
-                 affected=outcome["affected"])
+    Args:
+        samples: Mission, seconds into it, and value.
+        counts: By how much in an hour it may grow.
+    """
+    missions: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for mission, into_s, value in samples:
+        if into_s >= WARM_UP_S:
+            missions[mission].append((into_s / 3600, value))
+    around = []
+    for points in missions.values():
+        hour, level = (statistics.fmean(column) for column in zip(*points, strict=True))
+        around += [(t - hour, value - level) for t, value in points]
+    if len({t for t, _ in around}) < 2 or len({value for _, value in around}) < 2:
+        return 0.0
+    times, values = zip(*around, strict=True)
+    slope = statistics.linear_regression(times, values).slope
+    is_clear = statistics.correlation(times, values) > CLEAR
+    return slope if is_clear and slope > counts else 0.0
 
 
-def main(arguments: list[str] | None = None) -> int:
+def growths(records: Sequence[Record]) -> list[str]:
+    """Return which figures grow: of all processes together, of the root, and of the others.
+
+    The two routers count as one: all clients are of one of them, and change over when it is killed.
+    """
+    samples = [r for r in records if r["kind"] == "sample"]
+    names = {name for r in samples for name in r["used"]} - set(ROUTERS)
+    found = []
+    for what in (ALL, "routers", *sorted(names)):
+        for place, counts in enumerate(COUNTS.get(what, ONE)):
+            values = []
+            for r in samples:
+                members = {ALL: r["used"], "routers": ROUTERS}.get(what, (what,))
+                if r["used"].keys() >= set(members):
+                    values.append((r["mission"], r["into_s"],
+                                   sum(r["used"][name][place] for name in members)))
+            if grown := rise(values, counts):
+                found.append(f"{what}: {FIGURES[place]} grow by {grown:.1f} an hour")
+    return found
+
+
+def wrong(records: Sequence[Record]) -> list[str]:
+    """Return what was not as it has to be."""
+    return [*(f"mission {r['mission']}: {r['safety']}: {'; '.join(r['reasons'])}"
+              for r in records if r["kind"] == "mission" and r["safety"] != "safe"),
+            *(f"mission {r['mission']}, {r['at_s']:g} s: {r['name']} not back after {r['way']}"
+              for r in records if r["kind"] == "hit" and r["back_s"] is None),
+            *growths(records)]
+
+
+def main() -> int:
     """Run what was asked for and return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -218,19 +215,23 @@ def main(arguments: list[str] | None = None) -> int:
                         "(default: 8)")
     parser.add_argument("--file", type=Path, default=Path("reports/soak.jsonl"),
                         help="JSON lines of all that was done (default: %(default)s)")
-    parser.add_argument("--summary", action="store_true", help="only print what is in the file")
-    options = parser.parse_args(arguments)
-    if not 0 < options.hours < 1000:
-        parser.error(f"--hours {options.hours:g}: must be above 0 and below 1000")
+    options = parser.parse_args()
     log = Log(options.file, options.seed)
-    if not options.summary:
-        with tempfile.TemporaryDirectory() as folder:
-            while lasted_s(log) < 3600 * options.hours - 1:
-                if not one_mission(Path(folder) / f"run{len(log.of('begin'))}", log, options):
-                    break
-    for line in summary(log.records):
-        say(line)
-    return int(bool(wrong(log.records)))
+    is_safe = True
+    while is_safe and lasted_s(log) < 3600 * options.hours - 1:
+        directory = options.file.with_suffix("") / f"mission-{len(log.of('begin'))}"
+        is_safe = one_mission(directory.resolve(), log, options)
+    missions, hits = log.of("mission"), log.of("hit")
+    say(f"{lasted_s(log) / 3600:.2f} hours, {len(missions)} missions: "
+        f"{sum(m['safety'] == 'safe' for m in missions)} safe, "
+        f"{sum(m['verdict'] == 'success' for m in missions)} successful, "
+        f"{sum(m['cut'] for m in missions)} cut, {sum(m['resets'] for m in missions)} resets of "
+        "the emergency stop")
+    say(f"process hit until it is replaced: {spread(h['back_s'] for h in hits)}")
+    found = wrong(log.records)
+    for line in found:
+        say(f"WRONG {line}")
+    return int(bool(found))
 
 
 if __name__ == "__main__":

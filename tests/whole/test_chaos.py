@@ -1,13 +1,17 @@
-"""Short chaos: what every change has to survive. `make chaos` and `make chaos-pairs` are longer."""
+"""Short chaos, which every change has to survive; `make chaos` and `make soak` are longer."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
+import json
+import random
+import subprocess
+import sys
+from itertools import pairwise
 
 import pytest
 
 from rampart.testing import RealRun
+from tests import ROOT
 from tests.whole.chaos import (
     PAUSE,
     ROOT_PROCESS,
@@ -20,21 +24,15 @@ from tests.whole.chaos import (
     targets,
 )
 from tests.whole.chaos_runs import Log, load, pairs_in_a_mission, start
-from tests.whole.checkpoint_runs import SHORT_LIGHTS, write_short_mission
-from tests.whole.leak_counts import Counts, leaks
+from tests.whole.leak_counts import leaks
+from tests.whole.missions import write_row_mission, write_short_mission
+from tests.whole.soak_runs import EVERY_S, plan, wrong
 
 PAUSE_S = (0.3, 1.0)
 ALL_FOUR = ("mission_manager", "router_a", "safety_pilot", "ftm_manager", "supervisor")
 
 
-def write_row(directory: Path) -> Path:
-    """Write mission A without its way home."""
-    file = directory / "ROW.miss"
-    file.write_text("x=-22,y=-18.5,taxi=1\nx=23.5,y=-18.5,taxi=0\n")
-    return file
-
-
-def test_every_process_is_hit_in_every_way_and_world_and_root_are_only_paused():
+def test_plans_have_every_process_in_every_way_every_pair_and_a_fault_every_five_seconds():
     of = targets(load())
     hits = [hit for strike in each_in_every_way(of, 1, PAUSE_S) for hit in strike.hits]
     assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "router_a", "router_b", "pool",
@@ -42,44 +40,57 @@ def test_every_process_is_hit_in_every_way_and_world_and_root_are_only_paused():
     assert sorted((h.name, h.way) for h in hits) == sorted(
         [*[("simulator", PAUSE), (ROOT_PROCESS, PAUSE)] * len(WAYS),
          *((name, way) for name in of.mortal for way in WAYS)])
-
-
-def test_every_two_processes_are_a_pair_and_those_of_the_supervisor_in_all_combinations_of_ways():
-    of = targets(load())
     pairs = every_pair(of, 1)
     count = len({*of.mortal, *of.paused} - {"pool"})
     assert len({frozenset(pair.names) for pair in pairs}) == count * (count - 1) // 2
     assert sum(set(pair.names) == {"supervisor", "DM4"} for pair in pairs) == 9
     assert sum(set(pair.names) == {"DM4", "DM5"} for pair in pairs) == 1
+    soak, faults = plan(load(), 1, 0)
+    assert {hit.name for _, hit in soak[:len(of.mortal)]} == set(of.mortal)
+    times = sorted([at_s for at_s, _ in soak] + [fault.at_s for fault in faults])
+    assert {round(b - a, 6) for a, b in pairwise(times)} == {EVERY_S}
 
 
-COUNTS = Counts({"supervisor": 60, ROOT_PROCESS: 10}, {"supervisor": 90.0, ROOT_PROCESS: 50.0},
-                34, 0, 99, frozenset({"a"}))
+def test_what_becomes_more_is_a_leak_but_spare_connections_and_a_little_memory_are_none():
+    before = {"processes": 34.0, "descriptors of run": 60.0, "descriptors of root": 10.0,
+              "MB of run": 90.0}
+    assert leaks(before, before) == leaks(before, {
+        **before, "descriptors of run": 94.0, "MB of run": 104.0, "processes": 33.0}) == []
+    for more in ({"processes": 35.0}, {"descriptors of run": 95.0}, {"MB of run": 106.0},
+                 {"descriptors of root": 11.0}):
+        assert len(leaks(before, {**before, **more})) == 1
 
 
-def test_the_same_or_less_is_no_leak_nor_are_spare_connections_and_a_little_memory():
-    assert leaks(COUNTS, COUNTS) == []
-    assert leaks(COUNTS, replace(
-        COUNTS, processes=33, descriptors={"supervisor": 94, ROOT_PROCESS: 9},
-        memory_mb={"supervisor": 100.0, ROOT_PROCESS: 50.0})) == []
-
-
-@pytest.mark.parametrize("after", [
-    {"descriptors": {"supervisor": 95, ROOT_PROCESS: 10}},
-    {"descriptors": {"supervisor": 60, ROOT_PROCESS: 11}},
-    {"memory_mb": {"supervisor": 110.0, ROOT_PROCESS: 50.0}},
-    {"processes": 35}, {"zombies": 1}, {"files": 100},
-    {"shared_memory": frozenset("ab")}], ids=" ".join)
-def test_whatever_becomes_more_is_one_leak(after):
-    assert len(leaks(COUNTS, replace(COUNTS, **after))) == 1
+@pytest.mark.parametrize(("an_hour", "found"), [
+    (0.0, []), (-30.0, []), (3.0, []), (30.0, ["routers: MB of its own grow"])])
+def test_growth_of_routers_that_change_over_is_found_whatever_the_level_of_each_mission(
+        tmp_path, an_hour, found):
+    log, dice = Log(tmp_path / "log.jsonl", 1), random.Random(1)
+    for mission in range(3):
+        for s in range(0, 1200, 10):
+            warming = 20.0 - max(0.0, 300 - s) / 15
+            mb = 500 - 40 * mission + an_hour * s / 3600 + warming + dice.gauss(0, 0.3)
+            one, other = (12.0, 8.0) if s < 700 else (8.0, 12.0)
+            log.add("sample", mission=mission, into_s=float(s), at_s=1200.0 * mission + s, used={
+                "router_a": [mb + one, 30, 9], "router_b": [other, 30, 9], "DM1": [9.0, 20, 5]})
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"kind": "sam')
+    again = Log(tmp_path / "log.jsonl", 1)
+    assert again.records == log.records, "after a line that was cut off"
+    assert [line.partition(" by ")[0] for line in wrong(again.records)] == found
+    again.add("hit", mission=0, at_s=2.0, name="hmi", way="STOP", back_s=None)
+    again.add("mission", mission=0, safety="unsafe", reasons=["hit a wall"])
+    assert len(wrong(Log(tmp_path / "log.jsonl", 1).records)) == len(found) + 2
+    with pytest.raises(SystemExit, match="of another seed than 2"):
+        Log(tmp_path / "log.jsonl", 2)
 
 
 @pytest.mark.processes
 @pytest.mark.alone
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize(("rounds", "write", "lights"), [
-    (1, write_short_mission, tuple(SHORT_LIGHTS)),
-    pytest.param(len(WAYS), write_row, ("A",), marks=pytest.mark.slow)])
+    (1, write_short_mission, ("A01", "A02", "A03")),
+    pytest.param(len(WAYS), write_row_mission, ("A",), marks=pytest.mark.slow)])
 def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path, rounds, write, lights):
     strikes = each_in_every_way(Targets(ALL_FOUR, ("simulator", ROOT_PROCESS)), 5, PAUSE_S)
     strikes = strikes[:len(strikes) * rounds // len(WAYS)]
@@ -88,8 +99,8 @@ def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path, rounds, 
         chaos = Chaos(run)
         left = chaos.carry_out(strikes)
         code, result = run.result()
-    done = "\n".join(map(str, chaos.struck))
-    assert complaints(run, code, result, lights, chaos.struck) == [], f"{done}\n{run.story}"
+    assert [str(one) for one in chaos.struck if one.back_s is None] == []
+    assert complaints(code, result, run.story, lights) == [], run.story
     assert left == [], "the mission was over before every process was hit"
 
 
@@ -103,8 +114,27 @@ def test_a_mission_survives_a_dozen_pairs(tmp_path, capsys):
     plan = [pair for pair in every_pair(targets(load()), 1) if set(pair.names) <= among][:12]
     todo = dict(enumerate(plan))
     log = Log(tmp_path / "pairs.jsonl", 1)
-    pairs_in_a_mission(start(tmp_path / "run", write_row(tmp_path), 1.0), todo, log, ("A",))
+    pairs_in_a_mission(start(tmp_path / "run", write_row_mission(tmp_path), 1.0), todo, log, ("A",))
     printed = capsys.readouterr().out
     assert [p["missing"] for p in log.of("pair")] == [""] * len(log.of("pair")), printed
     assert log.of("mission")[0]["wrong"] == [], printed
     assert len(todo) <= 6, printed
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.alone
+@pytest.mark.timeout(300)
+def test_a_short_soak_is_safe_and_goes_on_where_it_was(tmp_path):
+    file = tmp_path / "log.jsonl"
+    for hours, begun in (("0.012", 1), ("0.02", 2)):
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.whole.soak_runs", "--hours", hours, "--laps", "0",
+             "--file", str(file)], check=False, capture_output=True, text=True, cwd=ROOT)
+        records = [json.loads(line) for line in file.read_text().splitlines()]
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert sum(r["kind"] == "begin" for r in records) == begun
+    missions = [r for r in records if r["kind"] == "mission"]
+    assert [(m["safety"], m["cut"]) for m in missions] == [("safe", True)] * 2
+    assert sum(r["kind"] == "hit" for r in records) > 3
+    assert all(len(r["used"]) > 30 for r in records if r["kind"] == "sample" and r["into_s"] > 5)

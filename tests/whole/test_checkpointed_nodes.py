@@ -6,18 +6,17 @@ import itertools
 import os
 import random
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.control.following.light_ledger import LightsKept
 from rampart.actors.osmosis.control.following.light_row import LightRow
 from rampart.actors.osmosis.control.following.path_follower import PathFollower
-from rampart.actors.osmosis.control.following.route_control import (
-    CONTROL_STATE,
-    ControlKept,
-)
+from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE, ControlKept
 from rampart.actors.osmosis.control.mission.mission_state import (
     MISSION_STATE,
     MissionState,
@@ -26,28 +25,29 @@ from rampart.actors.osmosis.control.mission.mission_state import (
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
 from rampart.actors.runtime.checkpoint_file import files_of, read
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import load_run
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
 from rampart.manager.arbitration.arbiter_state import Command, RecoveryHeard, ResetAsked, Tick
 from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from rampart.manager.spec.specification import parse_specification
+from rampart.sim.faults.scenario import parse_fault
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
+from rampart.sim.runs.virtual_run import VirtualRun
+from rampart.sim.virtual.virtual_processes import VirtualMachine
 from rampart.testing import RealRun
 from tests import ROOT
-from tests.actors.osmosis.control.world import World, drive
-from tests.whole.checkpoint_runs import (
-    CONTROL,
-    SHORT_LIGHTS,
-    assert_nothing_lost_or_doubled,
-    fly,
-    with_checkpoints,
-    write_near_mission,
-    write_short_mission,
-)
+from tests.actors.osmosis.control.world import Circle, World, drive
+from tests.whole.missions import SHORT_LIGHTS, write_near_mission, write_short_mission
 
 P = m.MissionPhase
 GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
-SPEC = parse_specification((ROOT / "systems" / "paper.toml").read_text(), "paper.toml")
+PAPER = (ROOT / "systems" / "paper.toml").read_text()
+SPEC = parse_specification(PAPER, "paper.toml")
+CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
+OK = m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK)
 
 
 def mission(step: int = 1, phase: m.MissionPhase = P.RUNNING, **changes) -> MissionState:
@@ -55,7 +55,7 @@ def mission(step: int = 1, phase: m.MissionPhase = P.RUNNING, **changes) -> Miss
     return MissionState("x", "X", phase, GOALS, step, 10.0, times, **changes)
 
 
-# -- the Mission Manager's state -----------------------------------------------------------------
+# -- states of nodes -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("state", "heard", "step", "times"), [
@@ -76,25 +76,18 @@ def test_a_mission_catches_up_with_the_step_that_others_were_given(state, heard,
 
 @pytest.mark.parametrize("state", [
     mission(9), mission(-1, step_times_s=()), mission(4), mission(2, step_times_s=(1.0,)),
-    msgspec.structs.replace(mission(), mission_id=""),
-    mission(lights=(m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2),
+    msgspec.structs.replace(mission(), mission_id=""), mission(lights=(OK, OK)),
     msgspec.structs.replace(mission(), goals=(m.Goal(float("nan"), 0.0, m.Mode.TAXI),) * 4),
-])
-def test_a_mission_that_makes_no_sense_is_refused(state):
-    with pytest.raises(StateError):
-        MISSION_STATE.decode(1, MISSION_STATE.encode(state))
-    assert MISSION_STATE.decode(1, MISSION_STATE.encode(mission())) == mission()
-
-
-@pytest.mark.parametrize("kept", [
-    ControlKept(LightsKept("x", (m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2)),
-    ControlKept(progress_m=float("nan")), ControlKept(row_start=(0.0, float("inf"))),
+    ControlKept(LightsKept("x", (OK, OK))), ControlKept(progress_m=float("nan")),
+    ControlKept(row_start=(0.0, float("inf"))),
     ControlKept(LightsKept("x"), m.Route("y", 0, m.Mode.TAXI, True, (), "")),
 ])
-def test_a_state_of_osmosis_control_that_makes_no_sense_is_refused(kept):
+def test_a_state_that_makes_no_sense_is_refused(state):
+    form, sound = ((MISSION_STATE, mission()) if isinstance(state, MissionState)
+                   else (CONTROL_STATE, ControlKept()))
     with pytest.raises(StateError):
-        CONTROL_STATE.decode(1, CONTROL_STATE.encode(kept))
-    assert CONTROL_STATE.decode(1, CONTROL_STATE.encode(ControlKept())) == ControlKept()
+        form.decode(1, form.encode(state))
+    assert form.decode(1, form.encode(sound)) == sound
 
 
 # -- rows, again ---------------------------------------------------------------------------------
@@ -121,8 +114,6 @@ def test_going_back_turns_round_passes_the_stretch_again_and_arrives():
 
 
 def test_a_way_back_that_is_blocked_is_given_up():
-    from tests.actors.osmosis.control.world import Circle
-
     world, row = World(x_m=10.0), LightRow(((0.0, 0.0), (14.0, 0.0)))
     world.circles.append(Circle(7.0, 0.0, 0.4))
     row.step(10.0, 0.0, 0.0, NO_POINTS, 0.05)
@@ -197,59 +188,96 @@ def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():
     assert recall(arbiter, memory, 8.0, 70_000).number == 70_000
 
 
-def test_modules_that_there_are_no_more_are_left_out_of_a_memory():
+def test_a_memory_that_makes_no_sense_is_refused_and_modules_of_the_past_are_left_out():
+    for memory, why in (
+            (Memory(-1), "decision number -1"), (Memory(2**60), "decision number 1152921504"),
+            (Memory(1, (), (("DM1", float("nan"), 0.0),)), "bucket of DM1")):
+        assert objection(memory).startswith(why)
+    assert objection(Memory(1)) == ""
+    assert objection(Memory(1, (Latch(Command("RM2", False, 1), ()),))) == ""  # beneath a safer one
     arbiter = build_arbiter(SPEC)
     memory = Memory(5, (Latch(Command("RM9", True, 5), ()),), (("DM9", 1.0, 1.0),))
     assert recall(arbiter, memory, 1.0, 0) == arbiter.initial(1.0, 5)
 
 
-@pytest.mark.parametrize(("memory", "why"), [
-    (Memory(-1), "decision number -1"),
-    (Memory(2**60), "decision number 1152921504606846976"),
-    (Memory(1, (Latch(Command("RM2", False, 1), ()),)), ""),  # beneath a safer one
-    (Memory(1, (), (("DM1", float("nan"), 0.0),)), "bucket of DM1"),
-    (Memory(1), ""),
-])
-def test_a_memory_that_makes_no_sense_is_refused(memory, why):
-    assert objection(memory).startswith(why)
-    assert bool(objection(memory)) == bool(why)
-
-
 # -- whole missions in virtual time --------------------------------------------------------------
 
 
+def with_checkpoints(folder: Path) -> Path:
+    """Write the paper's system with checkpoints."""
+    assert PAPER.count("checkpoints = false") == 1
+    file = folder / "kept.toml"
+    file.write_text(PAPER.replace("checkpoints = false", "checkpoints = true"))
+    return file
+
+
+class Flight(MissionTrial):
+    """A mission of the paper's system with checkpoints, and what is said in it, by kind."""
+
+    @classmethod
+    def fly(cls, mission: Path, *faults: str, seed: int = 1, patience_s: float = 60.0) -> Flight:
+        plan = RunPlan(seed=seed, system_file=str(with_checkpoints(mission.parent)),
+                       options={"mission": str(mission)})
+        flight = cls(load_run(plan, load_system(plan)), patience_s)
+        flight.heard: dict[type, list[Any]] = {}
+        flight.result = VirtualRun(flight, scenario=tuple(map(parse_fault, faults))).run()
+        return flight
+
+    def sinks(self, clock):
+        def take(_topic, message, _header):
+            self.heard.setdefault(type(message), []).append(message)
+
+        return [*super().sinks(clock), take]
+
+    def told(self, words: str) -> list[str]:
+        """Return the nodes that reported something with these words."""
+        return sorted(d.node for d in self.heard.get(bm.Diagnostic, ()) if words in d.reason)
+
+    def assert_nothing_lost_or_doubled(self) -> None:
+        """Safe success, no step twice or left out, each light measured once and rightly."""
+        record = self.result.record
+        assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
+        assert self.result.failures == ()
+        said = [status for status in self.heard[m.MissionStatus] if status.mission_id]
+        steps = [status.step for status in said]
+        assert steps == sorted(steps), "the mission went back a step"
+        assert len(said[-1].step_times_s) == len(said[-1].goals)
+        assert sorted(light.light for light in said[-1].lights) == sorted(SHORT_LIGHTS)
+        assert {light.light: light.verdict for light in said[-1].lights} == SHORT_LIGHTS
+        # A measurement may be sent again; another one of the same light would be another value.
+        assert len({(light.light, light.intensity_cd)
+                    for light in self.heard[m.LightMeasurement]}) == len(SHORT_LIGHTS)
+
+
 @pytest.fixture
-def short(tmp_path) -> str:
-    return str(write_short_mission(tmp_path))
+def short(tmp_path) -> Path:
+    return write_short_mission(tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [
+    0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(1, 40))])
 def test_control_nodes_die_at_random_moments_and_nothing_is_lost_or_doubled(short, seed):
     dice = random.Random(seed)
     faults = [f"{dice.choice(('kill', 'kill', 'stop', 'wedge'))}:{node}@{dice.uniform(1, 54):.3f}"
               for node in CONTROL]
-    assert_nothing_lost_or_doubled(fly(short, faults, seed=seed), SHORT_LIGHTS)
-
-
-def test_all_control_nodes_may_die_at_once(short):
-    run = fly(short, [f"kill:{node}@{t}" for t in (20.0, 43.0) for node in CONTROL])
-    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
-    assert run.result.record.restarts == dict.fromkeys(CONTROL, 2)
+    Flight.fly(short, *faults, seed=seed).assert_nothing_lost_or_doubled()
 
 
 @pytest.mark.parametrize("faults", [
-    ["kill:mission_manager@goal1:0.0", "kill:mission_manager@goal2:0.0"],
-    ["kill:graph_planner@goal1:0.0", "kill:osmosis_control@goal2:0.0"]])
-def test_a_death_in_the_very_step_from_one_goal_to_the_next_skips_and_repeats_none(short, faults):
-    assert_nothing_lost_or_doubled(fly(short, faults), SHORT_LIGHTS)
+    [f"kill:{node}@{t}" for t in (20.0, 43.0) for node in CONTROL],  # all at once
+    ["kill:mission_manager@goal1:0.0", "kill:graph_planner@goal1:0.0",  # in the very step
+     "kill:mission_manager@goal2:0.0", "kill:osmosis_control@goal2:0.0"]])
+def test_deaths_at_once_and_from_one_goal_to_the_next_skip_and_repeat_no_step(short, faults):
+    flight = Flight.fly(short, *faults)
+    flight.assert_nothing_lost_or_doubled()
+    assert sum(flight.result.record.restarts.values()) == len(faults)
 
 
 def test_a_light_whose_pass_was_cut_is_gone_back_for(short):
-    run = fly(short, ["stop:osmosis_control@42"])
-    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
-    assert ("light inspection", "passed without a measurement, going back") in {
-        (d.context, d.reason) for d in run.diagnostics}
-    assert run.result.record.duration_s > 62  # 57 s without
+    flight = Flight.fly(short, "stop:osmosis_control@42")
+    flight.assert_nothing_lost_or_doubled()
+    assert flight.told("passed without a measurement, going back")
+    assert flight.result.record.duration_s > 62  # 57 s without
 
 
 def newest_corrupt(loaded: Loaded) -> Loaded:
@@ -262,8 +290,6 @@ def newest_corrupt(loaded: Loaded) -> Loaded:
 def tampering(monkeypatch):
     """Change what the second and later lives of a node load: `tampering(node, change)`."""
     load, changes = MemoryCheckpoints.load, {}
-    from rampart.sim.virtual.virtual_processes import VirtualMachine
-
     store = VirtualMachine._store
 
     def naming(self, name, incarnation):
@@ -284,10 +310,10 @@ def test_a_newest_checkpoint_that_is_torn_gives_way_to_the_one_before(short, tam
     for node in CONTROL:
         tampering(node, newest_corrupt)
     # Just after the step: the one before is of the goal that is reached.
-    run = fly(short, ["kill:mission_manager@goal2:0.02", "kill:graph_planner@goal1:0.1",
-                      "kill:osmosis_control@45", "kill:mission_manager@47"])
-    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
-    assert sorted(d.node for d in run.diagnostics if "taking the newest sound one" in d.reason) == [
+    flight = Flight.fly(short, "kill:mission_manager@goal2:0.02", "kill:graph_planner@goal1:0.1",
+                        "kill:osmosis_control@45", "kill:mission_manager@47")
+    flight.assert_nothing_lost_or_doubled()
+    assert flight.told("taking the newest sound one") == [
         "graph_planner", "mission_manager", "mission_manager", "osmosis_control"]
 
 
@@ -299,22 +325,23 @@ def test_a_newest_checkpoint_that_is_torn_gives_way_to_the_one_before(short, tam
 def test_without_any_sound_checkpoint_the_mission_ends_safely_and_says_so(
         short, tampering, change):
     tampering("mission_manager", change)
-    run = fly(short, ["kill:mission_manager@12"])
-    assert (run.result.record.mission, run.result.record.safety) == ("fail", "safe")
-    assert run.result.record.restarts == {"mission_manager": 1}, "a crash loop"
-    assert any("starting without a checkpoint" in d.reason for d in run.diagnostics)
+    flight = Flight.fly(short, "kill:mission_manager@12")
+    record = flight.result.record
+    assert (record.mission, record.safety) == ("fail", "safe")
+    assert record.restarts == {"mission_manager": 1}, "a crash loop"
+    assert flight.told("starting without a checkpoint")
 
 
 def test_planner_and_control_go_on_without_any_checkpoint(short, tampering):
     for node in ("graph_planner", "osmosis_control"):
         tampering(node, lambda _: Loaded())
-    run = fly(short, ["kill:graph_planner@20", "kill:osmosis_control@25",
-                      "kill:osmosis_control@45", "kill:graph_planner@46"])
-    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
+    Flight.fly(short, "kill:graph_planner@20", "kill:osmosis_control@25", "kill:osmosis_control@45",
+               "kill:graph_planner@46").assert_nothing_lost_or_doubled()
 
 
 def test_an_emergency_stop_outlives_recovery_module_and_manager(short):
-    record = fly(short, ["gps-dropout@3+3", "kill:RM1@8", "kill:ftm_manager@8"]).result.record
+    record = Flight.fly(short, "gps-dropout@3+3", "kill:RM1@8", "kill:ftm_manager@8",
+                        patience_s=10.0).result.record
     assert (record.mission, record.safety) == ("fail", "safe")
     assert record.restarts == {"RM1": 1, "ftm_manager": 1}
     assert record.decisions[-1].recoveries == ("RM1",)

@@ -7,14 +7,17 @@ virtual time, on the paper's system and on the full one.
 
 from __future__ import annotations
 
-from functools import partial
+import re
 
 import pytest
 
-from rampart.sim.campaign.job import RunResult, run_job, run_virtually
+from rampart.sim.campaign.job import Job, RunResult, run_job, run_virtually
+from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial import run_end
-from tests.whole.layer_runs import LAYERS, layered_job
+from tests import system_file
 
+LAYERS = ("dead_man", "safety_pilot_checks", "manager_watch", "supervisor_respawn", "ftm",
+          "checkpoints")
 STALE = "command-not-updated@14+inf"
 """The robot drives on with its last command: straight off the pavement, unless somebody acts."""
 
@@ -24,12 +27,25 @@ NO_STANDBY = "kill:standby_control@13"
 
 @pytest.fixture
 def job(tmp_path, monkeypatch):
-    """Return a maker of runs of a system in which only the layers named are on.
+    """Return a maker of runs of mission A on a system in which only the layers named are on.
 
-    An unguarded robot that drives away is not watched for a whole minute.
+    A run ends soon after the robot has come to stand, and an unguarded robot that drives away is
+    not watched for a whole minute.
     """
     monkeypatch.setattr(run_end, "WATCH_S", 2.0)
-    return partial(layered_job, tmp_path)
+
+    def made(system: str, layers: tuple[str, ...], *faults: str) -> Job:
+        text = system_file(system).read_text(encoding="utf-8")
+        for layer in LAYERS:
+            text, found = re.subn(rf"(?m)^{layer} = (true|false)",
+                                  f"{layer} = {str(layer in layers).lower()}", text)
+            assert found == 1, layer
+        file = tmp_path / f"{system}-{'-'.join(layers)}.toml"
+        file.write_text(text, encoding="utf-8")
+        return Job(row="x", system=str(file), options={"mission": "A"}, patience_s=8.0,
+                   faults=tuple(map(parse_fault, faults)))
+
+    return made
 
 
 def both(made, system: str, layers: tuple[str, ...], without: tuple[str, ...], *faults: str
@@ -92,6 +108,7 @@ def test_the_manager_alone_stops_what_the_layers_below_would_let_pass(job):
     guarded, bare = both(job, "paper", ("ftm",), (), STALE)
     assert (guarded.safe, guarded.success) == (True, False)
     assert [(d.active, d.recoveries) for d in guarded.decisions] == [(("FTM2",), ("RM2",))]
+    assert 0.9 < guarded.detected_after_s < 1.1
     assert not bare.safe
 
 

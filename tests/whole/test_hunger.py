@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
@@ -19,15 +18,8 @@ from rampart.manager.spec.specification import check_document, read_document
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.access.keyed import layout_of, make_keys
-from tests.whole.hunger import (
-    OwnClock,
-    fill,
-    little_memory,
-    member,
-    no_descriptor_left,
-    processes,
-    small_disk,
-)
+from tests.whole.hunger import OwnClock, fill, member, no_descriptor_left, processes, small_disk
+from tests.whole.missions import write_taxi_mission
 
 pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(500)]
 
@@ -42,26 +34,6 @@ with join() as session:
     print("here", flush=True)
     time.sleep(1000)
 """
-
-EATS_MEMORY = """
-import time
-from pathlib import Path
-import sys
-Path(sys.argv[1], "cgroup.procs").write_text(str(__import__("os").getpid()))
-print("here", flush=True)
-eaten = []
-while True:
-    eaten.append(bytearray(b"x" * (1 << 20)))
-    time.sleep(0.005)
-"""
-
-
-def taxi(directory: Path) -> str:
-    """Write the first goal of mission A as a mission; half a minute."""
-    file = directory / "TAXI.miss"
-    file.write_text("x=-22,y=-18.5,taxi=1\n", encoding="utf-8")
-    return str(file)
-
 
 def succeeds(run: RealRun) -> dict[str, object]:
     """Wait for the end, and see that it is a good one."""
@@ -85,8 +57,8 @@ def test_a_full_disk_costs_what_cannot_be_written_and_nothing_else(tmp_path, mon
     """Checkpoints, folder of the run, recording and report lie on it."""
     with small_disk(tmp_path / "disk", 16) as disk:
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(disk))
-        with RealRun(tmp_path, "osmosis", "--mission", taxi(tmp_path), "--report",
-                     str(disk / "report"), "--record", str(disk / "run.mcap")) as run:
+        with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path)),
+                     "--report", str(disk / "report"), "--record", str(disk / "run.mcap")) as run:
             run.wait_for("goal 1/")
             time.sleep(3)
             full = fill(disk)
@@ -103,7 +75,7 @@ def test_a_full_disk_costs_what_cannot_be_written_and_nothing_else(tmp_path, mon
 
 
 def test_without_a_descriptor_what_runs_goes_on_and_what_ends_comes_back_later(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", taxi(tmp_path)) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
         run.wait_for("goal 1/")
         time.sleep(3)
         before = pids(run)
@@ -116,21 +88,10 @@ def test_without_a_descriptor_what_runs_goes_on_and_what_ends_comes_back_later(t
         succeeds(run)
 
 
-def test_of_all_that_want_more_memory_than_there_is_the_one_that_eats_it_dies(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", taxi(tmp_path)) as run:
-        run.wait_for("goal 1/")
-        time.sleep(3)
-        before = pids(run)
-        with little_memory(run, 256) as group, member(run, EATS_MEMORY, str(group)) as eater:
-            assert eater.wait(60) == -signal.SIGKILL
-            assert pids(run) == before
-        succeeds(run)
-
-
 def test_the_time_of_day_may_jump_in_mid_run(tmp_path, monkeypatch):
     clock, day_s = OwnClock(tmp_path), 86_400
     monkeypatch.setattr(RealRun, "command", (*clock.before_command, *RealRun.command))
-    with RealRun(tmp_path, "osmosis", "--mission", taxi(tmp_path)) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
         run.wait_for("goal 1/")
         for jump_s in (400 * day_s, -3000 * day_s, 1, -1, 0):
             clock.jump(jump_s)
@@ -143,7 +104,7 @@ def test_the_time_of_day_may_jump_in_mid_run(tmp_path, monkeypatch):
 
 
 def test_a_member_that_hears_all_and_reads_nothing_is_let_go_of(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", taxi(tmp_path)) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
         run.wait_for("goal 1/")
         before, memory = pids(run), memory_mb(run)
         with member(run, HEARS_ALL) as slow:

@@ -12,7 +12,6 @@ import pytest
 
 from rampart.actors.access import key_folder
 from rampart.actors.supervision.process_title import find_processes
-from rampart.cli.main import main
 from rampart.testing import RealRun
 from tests.actors.access.keyed import layout_of, make_keys
 
@@ -26,10 +25,7 @@ def keys(tmp_path):
 
 def kill(run, name):
     """Kill a node and wait for its second process; what is told of it may be lost with a router."""
-    done = subprocess.run([sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
-                           name, "--port", str(run.port)], capture_output=True, text=True,
-                          timeout=30, check=False)
-    assert done.returncode == 0, done.stderr
+    run.kill(name)
     run.wait_until(lambda: any(name in process.names and process.incarnation == 2
                                for process in find_processes(run.port)), 30, f"{name} is not back")
 
@@ -61,21 +57,17 @@ def test_tools_may_what_their_certificate_says_and_a_module_whose_own_expires_st
         tmp_path, keys):
     """The module is deaf from then on, and must not look as if it had detected nothing."""
     key_folder.issue(keys, ("DM3",), "node", days=15 / 86_400)
+    inject = ("inject", "drop:localization/pose", "--duration", "0.1")
     with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
         run.wait_for("goal 1/3", 60)
-        assert rampart(run, "node", "list").returncode == 0
-        injected = rampart(run, "inject", "drop:localization/pose", "--duration", "0.1")
-        assert injected.returncode == 0, injected.stderr
-        looking = rampart(run, "status", key=keys / "bob.pem")
-        assert looking.returncode == 0, looking.stderr
-        refused = rampart(run, "inject", "drop:localization/pose", key=keys / "bob.pem")
-        assert refused.returncode == 2
-        assert "a viewer's certificate cannot change a run" in refused.stderr
-        as_node = rampart(run, "inject", "drop:localization/pose", key=keys / "DM4.pem")
-        assert as_node.returncode == 1  # the router lets nothing through
-        missing = rampart(run, "status", key=keys / "none.pem")
-        assert missing.returncode == 2
-        assert "RAMPART_KEY=" in missing.stderr
+        for words, shown, code, why in (
+                (inject, None, 0, ""), (("status",), "bob", 0, ""),
+                (inject, "bob", 2, "a viewer's certificate cannot change a run"),
+                (inject, "DM4", 1, ""),  # the router lets nothing through
+                (("status",), "none", 2, "RAMPART_KEY=")):
+            done = rampart(run, *words, key=keys / f"{shown}.pem" if shown else None)
+            assert done.returncode == code, done.stderr
+            assert why in done.stderr
         run.wait_for(f"{keys / 'DM3.pem'}: the certificate of DM3 expired at", 60)
         assert "`rampart keys rotate DM3` renews it" in run.story
         run.wait_for("(DM3) silent: it counts as active", 20)
@@ -93,18 +85,12 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         key_folder.revoke(keys, ["ada"])
         for router in ("router_a", "router_b"):
             kill(run, router)
-        refused = rampart(run, "inject", "drop:localization/pose", key=stolen)
-        assert refused.returncode != 0
-        for words in (("status",), ("node", "list"), ("top", "--once")):
-            refused = rampart(run, *words, key=stolen)
-            assert (refused.returncode, refused.stdout) == (1, ""), words
-            assert "send ada no messages: its certificate is revoked" in refused.stderr
-            assert refused.stderr.count("\n") == 1
-        looking = rampart(run, "status", key=keys / "bob.pem")
-        assert looking.returncode == 0
-        assert "days left" in looking.stdout
-        left = json.loads(rampart(run, "status", "--json", key=keys / "bob.pem").stdout)["keys"]
-        assert left["days_left"] == pytest.approx(30, abs=0.1)
+        assert rampart(run, "inject", "drop:localization/pose", key=stolen).returncode != 0
+        refused = rampart(run, "status", key=stolen)
+        assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (1, "", 1)
+        assert "send ada no messages: its certificate is revoked" in refused.stderr
+        looking = json.loads(rampart(run, "status", "--json", key=keys / "bob.pem").stdout)
+        assert looking["keys"]["days_left"] == pytest.approx(30, abs=0.1)
         key_folder.issue(keys, ("eve",), "viewer")  # the routers do not know her yet
         early = rampart(run, "status", key=keys / "eve.pem")
         assert early.returncode == 1
@@ -119,14 +105,8 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
     (lambda keys: keys.chmod(0o755), "must be yours alone; chmod 700 it"),
     (lambda keys: (keys / "register.json").write_text("[]"), "register.json: "),
 ])
-def test_a_run_is_not_started_with_keys_that_are_no_good(keys, capsys, spoil, words):
+def test_a_run_is_not_started_with_keys_that_are_no_good_nor_in_virtual_time(keys, refused, spoil,
+                                                                             words):
+    assert "which has no links" in refused("run", "--virtual", "--keys", keys)
     spoil(keys)
-    assert main(["run", "--system", "paper", "--keys", str(keys), "--no-hmi"]) == 2
-    told = capsys.readouterr().err
-    assert words in told
-    assert told.count("\n") == 1
-
-
-def test_there_are_no_links_in_virtual_time(keys, capsys):
-    assert main(["run", "--virtual", "--keys", str(keys)]) == 2
-    assert "not with --virtual, which has no links" in capsys.readouterr().err
+    assert words in refused("run", "--system", "paper", "--keys", keys, "--no-hmi")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from rampart.cli import run as launch
 from rampart.testing import free_base_port
 from tests import ROOT, TANK
 
@@ -26,14 +25,6 @@ def changed(text: str, *changes: tuple[str, str]) -> str:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
     return text
-
-
-def application_of(text: str) -> str:
-    """Return the table `[application]` of a spec."""
-    return text[text.index("[application]"):text.index("\n\n", text.index("[application]"))]
-
-
-PORTER = changed(PAPER, (application_of(PAPER), ""), (WORLD, ""))
 
 
 def launched(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -59,17 +50,6 @@ def test_without_ground_truth_safety_is_not_known_in_console_json_page_and_exit_
     assert '<div class="verdict unknown">Safety<b>not known</b></div>' in page
     assert "stayed safe" not in page
     assert "4 safety not known" in launched(tmp_path, "--help").stdout
-
-
-def test_a_robot_without_airport_and_mission_runs_until_its_time_is_over(tmp_path):
-    (tmp_path / "porter.toml").write_text(PORTER)
-    done = launched(tmp_path, "--system", "porter.toml", "--duration", "6", "--rate", "4",
-                    "--no-hmi", "--json", "--port", str(free_base_port()), "--report",
-                    str(tmp_path / "report"))
-    assert done.returncode == 1, done.stderr  # nodes that need an airport never come up
-    result = json.loads(done.stdout.splitlines()[-1])
-    assert (result["mission"], result["safety"]) == (None, None)
-    assert result["duration_s"] >= 6
 
 
 PLAIN = """
@@ -98,19 +78,17 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", ["--rate=4", "--virtual", "--fault=drop:localization/pose"])
 @pytest.mark.parametrize("what", BROKEN)
 def test_an_actor_of_one_s_own_that_is_broken_is_one_line_before_anything_starts(
-        tmp_path, monkeypatch, capsys, what, how):
+        tmp_path, monkeypatch, refused, what):
     source, parameters, words = BROKEN[what]
     (tmp_path / "own.py").write_text(source)
     bounds = 'actor = "rampart.actors.osmosis.detection.bounds:Bounds"\n'
     (tmp_path / "own.toml").write_text(changed(
         PAPER, (bounds, f'actor = "own:Level"\nparameters = {{ {parameters} }}\n')))
     monkeypatch.chdir(tmp_path)
-    assert launch.main(["--system", "own.toml", how, "--no-hmi", "--report", "report"]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1, told
+    how = "--virtual" if what == "raises" else "--fault=drop:localization/pose"
+    told = refused("run", "--system", "own.toml", how, "--no-hmi", "--report", "report")
     assert "own.toml: detection DM3: " in told
     assert words.replace("HERE", str(tmp_path)) in told
     assert not (tmp_path / "report").exists()
@@ -140,7 +118,8 @@ def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
 
 
-def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
+@pytest.mark.processes
+def test_actors_beside_the_caller_are_found_by_toolbox_and_run_which_tells_of_tracebacks(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
     (tmp_path / "own.toml").write_text(
         changed(TANK, ("rampart.actors.runtime.stub_node:StubNode", "own:Own")))
@@ -149,13 +128,6 @@ def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
          "own.toml"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.processes
-def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
-    (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(
-        changed(TANK, ("rampart.actors.runtime.stub_node:StubNode", "own:Own")))
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "1", "--port",
                     str(free_base_port()), "--report", str(report))

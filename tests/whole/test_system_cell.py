@@ -19,18 +19,6 @@ from tests import CELL as FILE
 from tests import ROOT
 
 TEXT = FILE.read_text(encoding="utf-8")
-CELL = parse_specification(TEXT, "cell.toml")
-
-
-@pytest.mark.parametrize(("detections", "active"), [
-    (["D_ENCODER_A"], ()),
-    (["D_ENCODER_A", "D_ENCODER_C"], ("M_ENCODERS",)),
-    (["D_FORCE"], ()),
-    (["D_VISION"], ("M_MISSED_PART",)),
-    (["D_FORCE", "D_VISION"], ("M_CONTACT",)),
-])
-def test_gates_decide_which_mechanisms_are_active(detections, active):
-    assert CELL.build_mechanisms().detected_by(detections) == active
 
 
 WITHIN = 'against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }'
@@ -81,9 +69,7 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
     assert [d["recoveries"] for d in result["decisions"]][:1] == [["R_RESTART_MOTION"]]
 
 
-@pytest.mark.parametrize("verb", [
-    ["verify", str(FILE), "--strict", "--strategy", CELL.strategy, "--json"],
-    ["cut-sets", str(FILE), "--json"], ["table", "--system", str(FILE), "--json"]])
+@pytest.mark.parametrize("verb", ["cut-sets", "explain"])
 def test_the_verbs_take_it(capsys, verb):
-    assert main(verb) == 0
+    assert main([verb, str(FILE), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)

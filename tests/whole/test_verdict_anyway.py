@@ -21,8 +21,8 @@ from rampart.cli import run as launch
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.checkpoint_runs import write_short_mission
 from tests.whole.hunger import small_files
+from tests.whole.missions import write_short_mission
 
 UNSAFE = 3
 
@@ -41,36 +41,20 @@ def result_of(text: str) -> dict:
     return json.loads(text.splitlines()[-1])
 
 
-# -- streams -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("redirected", "complaint"), [
     (">/dev/full", "launch.py: stdout: No space left on device: the result is lost"),
-    *(pytest.param(one, "", marks=pytest.mark.nightly) for one in (">&-", "2>/dev/full", "2>&-")),
-    (">&- 2>&- <&-", ""),
-    (">/dev/full 2>/dev/full", ""), ("1</dev/null", "Bad file descriptor: the result is lost")])
+    (">&- 2>&- <&-", ""), ("1</dev/null", "Bad file descriptor: the result is lost"),
+    ("| true", "")])
 def test_an_unsafe_run_is_unsafe_though_nobody_can_be_told(tmp_path, redirected, complaint):
+    script = f'{{ "$@"; echo $? >{tmp_path}/code; }} {redirected}'
     done = subprocess.run(
-        ["/bin/sh", "-c", f'"$@" {redirected}', "sh", *unsafe(tmp_path)], cwd=tmp_path,
-        capture_output=True, text=True, check=False, timeout=100)
-    assert done.returncode == UNSAFE, done.stderr
+        ["/bin/sh", "-c", script, "sh", *unsafe(tmp_path)], cwd=tmp_path, capture_output=True,
+        text=True, check=False, timeout=100)
+    assert (tmp_path / "code").read_text() == f"{UNSAFE}\n", done.stderr
     assert "Traceback" not in done.stderr
     assert complaint in done.stderr
-    if ">&-" not in redirected.split() and "1<" not in redirected and ">/dev/full" not in \
-            redirected.split():
-        assert result_of(done.stdout)["safety"] == "unsafe"
     page, = (tmp_path / "report").glob("*.html")
     assert "not safe" in page.read_text()
-
-
-def test_an_unsafe_run_is_unsafe_though_its_reader_has_seen_enough(tmp_path):
-    run = subprocess.Popen(unsafe(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert run.stdout is not None
-    assert run.stderr is not None
-    assert run.stderr.readline()
-    run.stderr.close()
-    run.stdout.close()
-    assert run.wait(100) == UNSAFE
 
 
 STUCK = """
@@ -114,32 +98,24 @@ def test_no_file_gets_the_number_of_a_closed_stream():
 
 
 @pytest.mark.parametrize(("arguments", "redirected", "code"), [
-    (("verify", "paper", "--strict", "--strategy", "safety-first"), "| true", 1),
-    (("verify", "paper", "--strict", "--strategy", "safety-first"), ">/dev/full", 1),
     (("verify", "paper", "--strict", "--strategy", "safety-first"), ">&- 2>&-", 1),
-    (("table", "--json"), "| true", 0),
-    (("table", "--json"), ">/dev/full", 2),
-    (("node", "list", "--port", "1024"), "2>&-", 2),
-])
+    (("table", "--json"), "| true", 0), (("table", "--json"), ">/dev/full", 2)])
 def test_the_toolbox_keeps_its_exit_code_too(tmp_path, arguments, redirected, code):
     script = f'{{ "$@"; echo $? >{tmp_path}/code; }} {redirected}'
     done = subprocess.run(
         ["/bin/sh", "-c", script, "sh", sys.executable, "-m", "rampart.cli.main", *arguments],
         cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
     assert (tmp_path / "code").read_text() == f"{code}\n", done.stderr
-    assert "Traceback" not in done.stderr
-    if code == 2 and "full" in redirected:
-        assert done.stderr == "rampart: stdout: No space left on device\n"
+    assert done.stderr == ("rampart: stdout: No space left on device\n" if code == 2 else "")
 
 
 # -- the report ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [0, 5000])
-def test_an_unsafe_run_is_unsafe_though_its_report_does_not_fit(tmp_path, size):
+def test_an_unsafe_run_is_unsafe_though_its_report_does_not_fit_nor_its_recording(tmp_path):
     done = subprocess.run(
-        unsafe(tmp_path), capture_output=True, text=True, check=False, timeout=100,
-        preexec_fn=small_files(size))
+        unsafe(tmp_path, "--record", str(tmp_path / "run.mcap")), capture_output=True, text=True,
+        check=False, timeout=100, preexec_fn=small_files(5000))
     assert done.returncode == UNSAFE, done.stderr
     result = result_of(done.stdout)
     assert (result["safety"], result["report"], result["record"]) == ("unsafe", None, None)
@@ -147,6 +123,7 @@ def test_an_unsafe_run_is_unsafe_though_its_report_does_not_fit(tmp_path, size):
     told = [line for line in done.stderr.splitlines() if "cannot be written" in line]
     assert told == [f"launch.py: report: {result['report_error']}"]
     assert not (tmp_path / "report").exists(), "an empty folder, or half a report"
+    assert "run.mcap: File too large: the recording ends after" in done.stderr
 
 
 def in_the_way(folder: Path) -> None:
@@ -154,8 +131,7 @@ def in_the_way(folder: Path) -> None:
     folder.write_text("something else")
 
 
-@pytest.mark.parametrize("error", [
-    jinja2.TemplateError("the page\nis broken"), ZeroDivisionError("a chart"), MemoryError()])
+@pytest.mark.parametrize("error", [jinja2.TemplateError("the page\nis broken"), MemoryError()])
 def test_a_page_that_cannot_be_made_costs_neither_record_nor_verdict(
         tmp_path, monkeypatch, capsys, error):
     def broken(_run):
@@ -182,18 +158,6 @@ def test_tracebacks_that_cannot_be_kept_cost_no_verdict(tmp_path, monkeypatch, c
     told = capsys.readouterr()
     assert result_of(told.out)["safety"] == "unsafe"
     assert "errors.log: cannot write tracebacks: Not a directory" in told.err
-
-
-# -- recordings ----------------------------------------------------------------------------------
-
-
-def test_an_unsafe_run_is_unsafe_though_its_recording_does_not_fit(tmp_path):
-    done = subprocess.run(
-        unsafe(tmp_path, "--record", str(tmp_path / "run.mcap")), capture_output=True, text=True,
-        check=False, timeout=100, preexec_fn=small_files(200_000))
-    assert done.returncode == UNSAFE, done.stderr
-    assert result_of(done.stdout)["safety"] == "unsafe"
-    assert "run.mcap: File too large: the recording ends after" in done.stderr
 
 
 def test_a_recording_that_is_taken_away_is_not_said_to_be_there(tmp_path):

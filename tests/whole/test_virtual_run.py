@@ -15,15 +15,12 @@ import pytest
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.cli import run as launch
 from rampart.sim.campaign.job import Job, run_job, run_virtually
-from rampart.sim.faults.scenario import PlannedFault, parse_fault
+from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.virtual_run import LEAD_S
 from rampart.testing import HEEDS_SIGNALS, RealRun
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.checkpoint_runs import write_near_mission, write_short_mission
-
-SHORT = parse_fault("kill:mission_manager@6")
-"""Loses the mission, so the run is over after ten simulated seconds."""
+from tests.whole.missions import write_near_mission, write_short_mission
 
 OVERLOAD = "slow:all:0.025@20+30"
 
@@ -44,41 +41,28 @@ def decisions(result):
     return [(d.active, d.recoveries) for d in result.decisions]
 
 
-def test_a_mission_without_a_fault_succeeds_without_a_decision(tmp_path):
-    result = run_job(job(options={"mission": str(write_short_mission(tmp_path))}))
-    assert (result.success, result.safe, result.decisions) == (True, True, ())
-    assert (result.false_alarms, result.failures) == (0, ())
-    assert result.detected_after_s is None
-    assert result.margins["obstacle_m"] > 0.3
-    assert result.margins["prohibited_m"] > 0.3
+def test_a_run_is_the_same_to_the_byte_in_another_process_and_another_with_another_seed(
+        tmp_path, capsys):
+    def arguments(seed: int) -> list[str]:
+        return ["--virtual", "--mission", str(write_near_mission(tmp_path)), "--seed", str(seed),
+                "--fault", "kill:mission_manager@6", "--fault", "wedge:DM2@3", "--fault",
+                "gps-noise@1", "--json", "--report", str(tmp_path / "report")]
 
+    def trace_of(printed: str) -> str:
+        result = json.loads(printed.splitlines()[-1])
+        assert all(fault["effective"] for fault in result["faults"])
+        return str(result["trace"])
 
-def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another():
-    first, again, other = (
-        run_job(job(SHORT.text(), "gps-noise@1", network="lossy", seed=seed)) for seed in (1, 1, 2))
-    assert first.trace == again.trace != other.trace
-    assert len(first.trace) == 64
+    def in_this_process(seed: int) -> str:
+        assert launch.main(arguments(seed)) == 0
+        return trace_of(capsys.readouterr().out)
 
-
-@pytest.mark.parametrize(("system", "write", "code"), [
-    ("osmosis", write_near_mission, 0),
-    *(pytest.param(system, write_short_mission, code, marks=pytest.mark.nightly)
-      for system, code in (("paper", 1), ("osmosis", 0)))])
-def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system, write, code):
-    traces = set()
-    mission = write(tmp_path)
-    for seed in ("0", "4711"):
-        done = subprocess.run(
-            [sys.executable, "launch.py", "--virtual", "--system", system,
-             "--mission", str(mission), "--seed", "5", "--fault", "kill:mission_manager@6",
-             "--fault", "wedge:DM2@3", "--json", "--report", str(tmp_path / seed)],
-            cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True,
-            check=False)
-        assert done.returncode == code, done.stderr
-        result = json.loads(done.stdout.splitlines()[-1])
-        assert [fault["effective"] for fault in result["faults"]] == [True, True]
-        traces.add(result["trace"])
-    assert len(traces) == 1
+    done = subprocess.run(
+        [sys.executable, "launch.py", *arguments(5)], cwd=ROOT, text=True, capture_output=True,
+        env={**os.environ, "PYTHONHASHSEED": "4711"}, check=False)
+    trace = in_this_process(5)
+    assert trace_of(done.stdout) == trace != in_this_process(6)
+    assert len(trace) == 64
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
@@ -138,15 +122,11 @@ def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tm
     assert sum(1 for _ in BagReader(tmp_path / "run.mcap").messages()) > 1000
 
 
-@pytest.mark.parametrize("fault", [
-    "drop:detection/DM1@10+inf", "slow:DM1@10",
-    *(pytest.param(fault, marks=pytest.mark.slow) for fault in (
-        "freeze:manager/status@10+inf",
-        "freeze:detection/DM1@10+inf", "delay:detection/DM2@10+inf",
-        "drop:manager/status@10+inf"))])
-def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(near, fault):
+@pytest.mark.parametrize("fault", ["drop:detection/DM1@10+inf", "slow:DM1@10"])
+def test_a_detection_module_that_lives_and_is_not_heard_costs_nothing(near, fault):
     result = run_job(job(fault, options=near))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
+    assert (result.false_alarms, result.failures) == (0, ())
     assert result.effective
 
 
@@ -157,30 +137,16 @@ def test_a_frozen_report_hides_no_fault():
     assert (("FTM2",), ("RM2",)) in decisions(result)
 
 
-def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
-    stale = "command-not-updated@8+inf"
-    bare, guarded = (run_job(job(stale, ftm=ftm, patience_s=15.0)) for ftm in (False, True))
-    assert (bare.safe, guarded.safe) == (False, True)
-    assert bare.unsafe_s > 8
-    assert decisions(guarded)[0] == (("FTM2",), ("RM2",))
-    assert guarded.stopped_for_good
-    assert 0.9 < guarded.detected_after_s < 1.1
-
-
-def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(near):
-    result = run_job(job("kill:osmosis_control@10", options=near))
+@pytest.mark.parametrize(("fault", "soonest_s", "latest_s"), [
+    ("kill:osmosis_control@10", 0.0, 0.1), ("stop:graph_planner@12", 0.3, 0.6),
+    ("wedge:osmosis_control@12", 0.3, 0.6)])
+def test_a_process_that_is_killed_or_silent_is_detected_and_replaced_and_the_mission_goes_on(
+        near, fault, soonest_s, latest_s):
+    result = run_job(job(fault, options=near))
     assert (result.success, result.safe) == (True, True)
     assert decisions(result) == [(("FTM4",), ("RM3",)), ((), ())]
-    assert 0 < result.detected_after_s < 0.1
-    assert result.detected_after_s < result.recovered_after_s < 0.5
-
-
-@pytest.mark.parametrize("fault", ["stop:graph_planner@12", "wedge:osmosis_control@12"])
-def test_a_stopped_or_wedged_process_is_detected_by_its_silence_and_replaced(near, fault):
-    result = run_job(job(fault, options=near))
-    assert decisions(result)[0] == (("FTM4",), ("RM3",))
-    assert 0.3 < result.detected_after_s < 0.6
-    assert result.recovered_after_s < result.detected_after_s + 0.2
+    assert soonest_s < result.detected_after_s < latest_s
+    assert result.detected_after_s < result.recovered_after_s < result.detected_after_s + 0.4
 
 
 def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(tmp_path):
@@ -191,15 +157,9 @@ def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_after
         (("FTM14",), ("RM2",)), ((), ())]
 
 
-@pytest.mark.parametrize(("write", "faults", "restarts"), [
-    (write_near_mission, ("drop:detection/DM2@10+8",), {"DM2": 1}),
-    pytest.param(write_short_mission, (OVERLOAD, "drop:detection/DM2@25+8"), {},
-                 marks=pytest.mark.slow)])
-def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(
-        tmp_path, write, faults, restarts):
-    mission = {"mission": str(write(tmp_path))}
-    record = run_virtually(job(*faults, system="osmosis", options=mission)).record
-    assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
+def test_a_module_that_is_not_heard_is_restarted(near):
+    record = run_virtually(job("drop:detection/DM2@10+8", system="osmosis", options=near)).record
+    assert (record.mission, record.safety, record.restarts) == ("success", "safe", {"DM2": 1})
 
 
 @pytest.mark.slow
@@ -226,9 +186,8 @@ def test_killed_guards_come_back_and_the_mission_goes_on(near):
                                "graph_planner": 1}
 
 
-@pytest.mark.parametrize("lasts_s", [1, 30])
-def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(near, lasts_s):
-    record = run_virtually(job(f"stop:all@10+{lasts_s}", system="osmosis", options=near)).record
+def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(near):
+    record = run_virtually(job("stop:all@10+30", system="osmosis", options=near)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert not [d for d in record.decisions if "RM1" in d.recoveries]
 
@@ -241,7 +200,7 @@ def test_what_dies_during_a_pause_of_everybody_is_restarted_after_it(near):
 
 
 def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(near):
-    lost = run_job(job("hang:ftm_manager@12+inf", options=near, patience_s=30.0))
+    lost = run_job(job("hang:ftm_manager@12+inf", options=near, patience_s=8.0))
     assert (lost.success, lost.safe, lost.stopped_for_good) == (False, True, True)
     record = run_virtually(job("hang:ftm_manager@12+6", options=near)).record
     assert (record.mission, record.safety) == ("success", "safe")
@@ -262,29 +221,21 @@ def test_a_supervisor_that_ends_too_often_waits_until_the_window_of_the_spec_has
     assert 14.5 < back_s[2] < 15.0  # ten seconds after the first restart, and the backoff
 
 
-def test_a_fault_without_effect_says_so_and_one_may_be_planned_for_a_goal():
-    result = run_job(job("imu-bias@2", "kill:DM1@900", "kill:mission_manager@goal2:1"))
+def test_a_fault_without_effect_says_so_and_one_may_be_planned_for_a_goal(near):
+    result = run_job(job("imu-bias@2", "kill:DM1@900", "kill:mission_manager@goal2:1",
+                         options=near))
     assert [o.effective for o in result.outcomes] == [False, False, True]
     assert [o.reason for o in result.outcomes] == [
         "it changed nothing", "its moment never came", ""]
     assert not result.success
-    assert result.duration_s > 25
+    assert result.duration_s > 8
 
 
 def test_the_baseline_has_no_fault_tolerance_at_all():
-    result = run_job(job("wedge:ftm_manager@2", "kill:localization@8", ftm=False))
+    result = run_job(job("wedge:ftm_manager@2", "kill:localization@8", ftm=False, patience_s=5.0))
     assert [o.effective for o in result.outcomes] == [False, True]
     assert result.outcomes[0].reason == "ftm_manager had no running process"
     assert (result.success, result.decisions) == (False, ())
-
-
-def test_a_job_survives_the_way_to_another_process_and_back():
-    import pickle
-
-    first = Job(row="x", faults=(PlannedFault("gps-bias", 3.0, duration_s=float("inf")),))
-    assert pickle.loads(pickle.dumps(first)).key == first.key
-    assert Job(row="other", faults=first.faults).key == first.key
-    assert Job(row="x", faults=first.faults, seed=2).key != first.key
 
 
 @pytest.mark.processes

@@ -27,7 +27,7 @@ from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from tests.actors.osmosis.control.laser_sweeps import RAYS, full_sweep
 from tests.osmosis_system import shipped_system
-from tests.whole.checkpoint_runs import write_near_mission
+from tests.whole.missions import write_near_mission
 
 REACH = reach_of(shipped_system())
 NO_RAY = [0.0, -1.0, -math.inf, math.nan, 0.01, 8.5, 1e6]

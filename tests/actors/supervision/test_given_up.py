@@ -28,7 +28,7 @@ from tests.actors.supervision.sick_actors import (
 from tests.actors.supervision.test_supervisor import PLAN
 from tests.actors.supervision.test_supervisor import running as played
 from tests.virtual_time import within
-from tests.whole.checkpoint_runs import write_short_mission
+from tests.whole.missions import write_short_mission
 
 
 def restarts_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import os
 import resource
 import select
@@ -33,7 +34,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.cli.operate import kill_node
 from rampart.testing import eventually
-from tests.stub_actors import IdlePose, launched, stub_plan, write_stub_system
+from tests.stub_actors import IdleDetection, IdlePose, launched, stub_plan, write_stub_system
 
 pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
 
@@ -138,6 +139,29 @@ async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(
     async with witness.comes_back(node):
         os.kill(witness.pid(node), number)
     assert witness.saw(node, event)
+
+
+class HangingDetection(IdleDetection):
+    """Hangs a while after its first start: DM1 spins, DM2 sleeps and holds the interpreter's lock."""
+
+    def on_start(self) -> None:
+        if self.context.incarnation == 1 and self.name in {"DM1", "DM2"}:
+            self.call_later(3.0, self.hang)
+
+    def hang(self) -> None:
+        if self.name == "DM2":
+            ctypes.PyDLL(None).sleep(1000)
+        while True:
+            pass
+
+
+async def test_a_loop_that_spins_or_holds_the_lock_is_found_and_replaced(tmp_path):
+    async with running(tmp_path, (
+            "tests.stub_actors:IdleDetection",
+            "tests.actors.supervision.test_supervision:HangingDetection")) as (_, witness):
+        await eventually(lambda: witness.saw("DM1", "wedged") and witness.saw("DM2", "wedged"), 20)
+        await eventually(lambda: {witness.state(name) for name in ("DM1", "DM2")}
+                         == {("running", 2)}, 20)
 
 
 async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(witness, port):

@@ -13,7 +13,7 @@ from rampart.actors.osmosis.control.pilot.laser_pair import LaserCheck
 from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from tests.whole.checkpoint_runs import write_near_mission
+from tests.whole.missions import write_near_mission
 
 
 def judge(references, period_s=0.05):
