@@ -68,15 +68,11 @@ class Network:
         addresses: Of the hosts, by name.
         line: Between any two; may be changed while packets go by.
         apart: Pairs of hosts that do not reach each other, whatever the line; may be changed, too.
-        passed: Packets that were handed on.
-        lost: Packets that were not.
     """
 
     addresses: dict[str, str]
     line: Line = field(default_factory=Line)
     apart: frozenset[frozenset[str]] = frozenset()
-    passed: int = 0
-    lost: int = 0
 
     def __post_init__(self) -> None:
         self._prefix = f"rampart-{os.getpid()}-{next(_NUMBERS)}"
@@ -141,7 +137,6 @@ class Network:
                     line, to = self.line, self._devices.get(packet[_DESTINATION])
                     if (to is None or line.is_cut or self._random.random() < line.loss
                             or {self._hosts[device], self._hosts[to]} in self.apart):
-                        self.lost += 1
                         continue
                     later_s = line.delay_s + self._random.random() * line.jitter_s
                     heapq.heappush(waiting, (now_s + later_s, next(numbers), to, packet))
@@ -149,7 +144,6 @@ class Network:
                 _, _, to, packet = heapq.heappop(waiting)
                 with contextlib.suppress(OSError):  # its queue is full, or it is down
                     os.write(to, packet)
-                self.passed += 1
 
 
 def _packets(device: int) -> Iterator[bytes]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import random
 from pathlib import Path
@@ -29,7 +28,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import load_run
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
-from rampart.manager.arbitration.arbiter_state import Command, RecoveryHeard, ResetAsked, Tick
+from rampart.manager.arbitration.arbiter_state import Command, RecoveryHeard
 from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from rampart.manager.spec.specification import parse_specification
@@ -93,26 +92,6 @@ def test_a_state_that_makes_no_sense_is_refused(state):
 # -- rows, again ---------------------------------------------------------------------------------
 
 
-def test_going_back_turns_round_passes_the_stretch_again_and_arrives():
-    world, row = World(), LightRow(((0.0, 0.0), (14.0, 0.0)))
-    turned = []
-
-    def each(now_s: float) -> None:
-        if world.x_m > 10.0 and not turned:
-            row.go_back(5.0)
-            turned.append(now_s)
-
-    motion = drive(world, row, 80.0, each=each)
-    assert motion.arrived
-    assert row.back_to is None
-    xs = [x for x, _ in world.track]
-    turned_at = next(i for i, x in enumerate(xs) if x > 10.0)
-    assert min(xs[turned_at:]) == pytest.approx(5.0, abs=0.3)
-    assert xs[-1] == pytest.approx(14.0, abs=0.2)
-    assert world.deviation([(0.0, 0.0), (14.0, 0.0)]) < 0.3
-    assert min(b - a for a, b in itertools.pairwise(xs)) > -0.06  # never faster than it may
-
-
 def test_a_way_back_that_is_blocked_is_given_up():
     world, row = World(x_m=10.0), LightRow(((0.0, 0.0), (14.0, 0.0)))
     world.circles.append(Circle(7.0, 0.0, 0.4))
@@ -140,37 +119,13 @@ def test_a_follower_that_resumes_stays_on_its_leg_where_the_route_comes_near_its
 # -- the arbiter's memory ------------------------------------------------------------------------
 
 
-def heard_all(arbiter, state, now, active=(), braking=False):
+def heard_all(arbiter, state, now, active=()):
     for name in arbiter.mechanisms.detections:
         state, _ = arbiter.step(state, DetectionHeard(name, name in active), now)
     for name in arbiter.mechanisms.recoveries:
-        on = braking and name == "RM1"
         state, _ = arbiter.step(state, RecoveryHeard(
-            name, on, Phase.DEGRADED if on else Phase.IDLE, state.desired[name].decision), now)
+            name, False, Phase.IDLE, state.desired[name].decision), now)
     return state
-
-
-def braked(arbiter):
-    state = heard_all(arbiter, arbiter.initial(0.0), 0.1)
-    state = heard_all(arbiter, state, 0.2, active=("DM1",), braking=True)
-    return heard_all(arbiter, state, 0.3, braking=True)
-
-
-def test_a_latch_survives_the_manager_and_its_recovery_module_together():
-    arbiter = build_arbiter(SPEC)
-    memory = remember(braked(arbiter), arbiter)
-    assert [latch.command.recovery for latch in memory.latches] == ["RM1"]
-    without = heard_all(arbiter, arbiter.initial(1.0, 10_000), 1.1)
-    assert without.activated == ()  # nobody knows of it any more
-    state = recall(arbiter, memory, 1.0, 10_000)
-    assert state.desired["RM1"].activate
-    for tick in range(200):
-        state = heard_all(arbiter, state, 1.1 + tick / 10, braking=tick > 3)
-        state, _ = arbiter.step(state, Tick(), 1.15 + tick / 10)
-        assert (state.activated, state.latched) == (("RM1",), ("RM1",))
-    state, _ = arbiter.step(state, ResetAsked("RM1", "operator"), 21.2)
-    assert state.latched == state.activated == ()
-    assert remember(state, arbiter).latches == ()
 
 
 def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():

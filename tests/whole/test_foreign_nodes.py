@@ -149,28 +149,6 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
     assert "wheels #1 ended: signal SIGKILL" in (tmp_path / "report/logs/wheels.log").read_text()
 
 
-def test_a_topic_may_be_the_heartbeat_and_two_commands_share_a_process(tmp_path):
-    write_tug(tmp_path)
-    (tmp_path / "tug.toml").write_text(TUG.replace("notify = true", 'topic = "tug/wheels"').replace(
-        'command = ["./wheels"]', 'command = ["./wheels"]\nprocess = "both"').replace(
-        "[[event]]", """
-[[node]]
-name = "beside"
-command = ["sleep", "604"]
-kind = "control"
-process = "both"
-
-[[event]]"""))
-    with RealRun(tmp_path, "tug.toml") as tug:
-        tug.sleep_until(1)
-        assert state(tug, "wheels") == state(tug, "beside") == ("running", 1)
-        beside = find(tug, "beside", "sleep 604")
-        os.kill(find(tug, "wheels", "/wheels"), signal.SIGSTOP)
-        comes_back(tug, "wheels", 2, "/wheels")
-        comes_back(tug, "beside", 2, "sleep 604")
-        assert gone(beside)
-
-
 def test_a_signal_that_stops_a_command_reaches_its_program_and_what_that_has_forked(tmp_path):
     write_tug(tmp_path, compiled=False)
     without_wheels(tmp_path, "".join(f"""
@@ -196,6 +174,8 @@ kind = "non-control"
         tug.wait_until(lambda: not stopped(), 2, "not continued")
         assert tug.pid("first") == signal_node("first", "KILL", tug.port).pid
         comes_back(tug, "first", 2, "echo first")
+        comes_back(tug, "second", 2, "echo second")  # of the same process
+        assert gone(second)
 
 
 CARRIER = """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -12,7 +11,6 @@ import time
 from collections import Counter
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -20,11 +18,10 @@ import pytest
 from rampart.actors.ftm import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of
-from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.access.keyed import every_key, layout_of, shown_by_strangers, try_all
-from tests.two_hosts import home_when_lost, two_hosts
+from tests.two_hosts import two_hosts
 from tests.whole.network import Line, Network, network, why_not
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone,
@@ -274,70 +271,3 @@ def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_pa
         robot.wait_for("waiting for ground: rampart run --host ground there")
         robot.process.send_signal(signal.SIGINT)
         robot.process.wait(10)
-
-
-@pytest.mark.slow
-def test_the_robot_brakes_when_the_host_that_drives_it_ends_as_a_whole(net, tmp_path):
-    spec = specification(net, tmp_path, ("simulator",), "paper", 0.02)
-    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as base,
-          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "A") as robot):
-        robot.wait_for("goal 1/", 60)
-        command = net.command("ground", sys.executable, "-u", "-m", "rampart.cli.main", "topic",
-                              "echo", "summit_xl/status", "--json", "--port", str(base.port))
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as echo:
-            try:
-                heard = (json.loads(line)["message"] for line in echo.stdout)
-                driving = next(one for one in heard if max(one["wheel_speeds_radps"]) > 1.0)
-                assert not driving["dead_man_tripped"]
-                for one in (*find_processes(robot.port), robot.process):
-                    os.kill(one.pid, signal.SIGKILL)
-                stands = next(one for one in islice(heard, 50)
-                              if max(map(abs, one["wheel_speeds_radps"])) < 1e-3)
-                assert stands["dead_man_tripped"]
-                assert all(one["dead_man_tripped"] for one in islice(heard, 20))  # nobody else's
-            finally:
-                echo.kill()
-
-
-@pytest.mark.slow
-def test_a_robot_that_is_to_come_home_when_nobody_can_reach_it_does(net, tmp_path):
-    spec = specification(net, tmp_path)
-    spec.write_text(home_when_lost(spec.read_text(encoding="utf-8")), encoding="utf-8")
-    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
-          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "A") as robot):
-        robot.wait_for("goal 2/", 120)
-        net.line = Line(is_cut=True)
-        robot.wait_for("DM15")
-        robot.wait_for("returning home", 15)
-        net.line = Line()
-        robot.wait_for("supervisor_ground back", 30)
-        code, result = robot.result(200)
-        assert ground.result(20)[0] == 0
-    assert (code, result["mission"], result["safety"]) == (1, "fail", "safe")
-    assert any("returned home, RM9: " in reason for reason in result["reasons"]), result["reasons"]
-    ran = {name for one in result["decisions"] for name in one["recoveries"]}
-    assert ran >= {"RM9"}, result["decisions"]
-    assert not ran & {"RM1", "RM2"}, result["decisions"]  # it drove, and was not stopped
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_mission_goes_on_over_a_bad_line_a_partition_and_the_end_of_the_other_host(
-        net, tmp_path):
-    spec = specification(net, tmp_path)
-    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
-          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "AB") as robot):
-        robot.wait_for("goal 1/", 60)
-        net.line = Line(**BAD)
-        robot.wait_for("goal 2/", 120)
-        net.line = Line(is_cut=True)
-        robot.wait_for("supervisor_ground unreachable")
-        robot.wait_for("goal 3/", 120)
-        net.line = Line(**BAD)
-        robot.wait_for("supervisor_ground back", 30)
-        before = len(robot.story)
-        ground.process.send_signal(signal.SIGKILL)
-        robot.wait_until(lambda: "supervisor_ground unreachable" in robot.story[before:], 10,
-                         "the loss of the other host was not told")
-        code, result = robot.result(400)
-    assert (code, result["mission"], result["safety"]) == (0, "success", "safe")

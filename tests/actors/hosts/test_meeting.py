@@ -8,7 +8,7 @@ import re
 import socket
 import ssl
 import threading
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager
 
 import msgspec
 import pytest
@@ -158,36 +158,29 @@ async def test_no_answer_and_a_nonsense_answer_are_errors_that_may_pass():
             await Attendance("ground", server.sockets[0].getsockname(), FIRST).ask()
 
 
-async def is_undisturbed(where) -> bool:
-    ground = Attendance("ground", where, FIRST)
-    told, _, _ = await ground.ask()
-    await ground.close()
-    return told.plan.run_id == "r1"
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000])
+@pytest.mark.parametrize("sent", [
+    b"", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000, "garbage", '{"host":"ground"}',
+    '{"host":"ground","serial":"1","contents":5}', "x" * 2_000_000])
 async def test_a_stranger_is_disconnected_and_disturbs_no_host(sent):
+    """It sends bytes, or a question that makes no sense."""
     async with meeting() as (_, where):
-        reader, writer = await asyncio.open_connection(*where)
-        with contextlib.suppress(ConnectionError):  # there was more than is read
-            writer.write(sent)
-            writer.write_eof()
-            assert b"r1" not in await asyncio.wait_for(reader.read(), 10)
-        writer.close()
+        if isinstance(sent, bytes):
+            reader, writer = await asyncio.open_connection(*where)
+            with contextlib.suppress(ConnectionError):  # there was more than is read
+                writer.write(sent)
+                writer.write_eof()
+                assert b"r1" not in await asyncio.wait_for(reader.read(), 10)
+            writer.close()
+        else:
+            async with connect("ws://first/", host=where[0], port=where[1]) as stranger:
+                await stranger.send(sent.encode())
+                with pytest.raises(ConnectionClosed):
+                    await asyncio.wait_for(stranger.recv(), 10)
         with pytest.raises(InvalidStatus, match="403"):  # a page in a browser
             await connect("ws://first/", host=where[0], port=where[1], origin="http://evil.example")
-        assert await is_undisturbed(where)
-
-
-@pytest.mark.parametrize("sent", [b"", "garbage", b'{"host":"ground"}', b"x" * 2_000_000,
-                                  b'{"host":"ground","serial":"1","contents":5}'])
-async def test_questions_that_make_no_sense_end_their_connection_only(sent):
-    async with meeting() as (_, where):
-        async with connect("ws://first/", host=where[0], port=where[1]) as stranger:
-            await stranger.send(sent)
-            with pytest.raises(ConnectionClosed):
-                await asyncio.wait_for(stranger.recv(), 10)
-        assert await is_undisturbed(where)
+        ground = Attendance("ground", where, FIRST)
+        assert (await ground.ask())[0].plan.run_id == "r1"
+        await ground.close()
 
 
 async def test_an_address_that_is_not_this_machine_s_is_told_in_a_line():
@@ -222,89 +215,65 @@ def keys(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["observer_ground", "DM5", "observer", "observer_moon", ""])
-async def test_with_keys_only_the_other_launcher_gets_an_answer(keys, name):
+@pytest.mark.parametrize(("door", "name", "error"), [
+    (DOOR, "observer_ground", None), (DOOR, "DM5", OSError), (DOOR, "observer", OSError),
+    (DOOR, "observer_moon", OSError), (DOOR, "", OSError),
+    ("router_b", "observer_ground", MeetingError)])
+async def test_with_keys_only_the_other_launcher_gets_an_answer_and_only_from_router_a(
+        keys, door, name, error):
     """The key of observer_moon is revoked."""
-    async with meeting(credentials=credentials_in(str(keys), DOOR)) as (_, where):
+    async with meeting(credentials=credentials_in(str(keys), door)) as (_, where):
         ground = Attendance("ground", where, FIRST, credentials_in(str(keys), name)
                             if name else None)
-        if name == "observer_ground":
+        with pytest.raises(error) if error else contextlib.nullcontext():
             assert (await ground.ask())[0].plan.run_id == "r1"
-        else:
-            with pytest.raises(OSError):  # noqa: PT011 of the connection, whatever it is
-                await ground.ask()
         await ground.close()
-
-
-async def test_an_impostor_of_the_first_host_with_another_router_s_key_is_refused(keys):
-    async with meeting(credentials=credentials_in(str(keys), "router_b")) as (_, where):
-        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
-        with pytest.raises(MeetingError, match="has not the certificate of router_a"):
-            await ground.ask()
-        await ground.close()
-
-
-# ---- silent peers -------------------------------------------------------------------------------
 
 
 UPGRADE = (b"GET / HTTP/1.1\r\nHost: first\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n")
 
 
-@contextmanager
-def in_a_thread(talk):
-    """Run a peer that talks, and then neither reads nor closes until the end."""
-    is_over = threading.Event()
-    thread = threading.Thread(target=talk, args=(is_over.wait,))
+@pytest.mark.parametrize("silent", ["ground", "first"])
+async def test_with_keys_nobody_waits_for_a_silent_peer(keys, silent):
+    """A line that was cut, a launcher that is stopped: TLS would wait half a minute for a word."""
+    where = ("127.0.0.1", free_port())
+    is_there, is_over = threading.Event(), threading.Event()
+
+    def ground():
+        secure = tls_context(credentials_in(str(keys), "observer_ground"), ssl.Purpose.SERVER_AUTH)
+        with secure.wrap_socket(socket.create_connection(where)) as peer:
+            peer.sendall(UPGRADE)
+            assert peer.recv(100_000).startswith(b"HTTP/1.1 101 ")
+            is_there.set()
+            is_over.wait()
+
+    def first():
+        secure = tls_context(credentials_in(str(keys), DOOR), ssl.Purpose.CLIENT_AUTH)
+        with socket.create_server(where) as server:
+            is_there.set()
+            with secure.wrap_socket(server.accept()[0], server_side=True) as peer:
+                peer.recv(100_000)
+                is_over.wait()
+
+    made = Meeting(PLAN, ("ground",), CONTENTS, dict)
+    if silent == "ground":
+        await made.open(*where, credentials_in(str(keys), DOOR))
+    thread = threading.Thread(target=ground if silent == "ground" else first)
     thread.start()
     try:
-        yield
+        await asyncio.to_thread(is_there.wait)
+        async with asyncio.timeout(15):
+            if silent == "ground":
+                await made.close()
+            else:
+                other = Attendance("ground", where, FIRST,
+                                   credentials_in(str(keys), "observer_ground"))
+                with pytest.raises(TimeoutError):
+                    await other.ask()
     finally:
         is_over.set()
         thread.join()
-
-
-async def test_with_keys_the_end_does_not_wait_for_a_silent_host(keys):
-    """A line that was cut, a launcher that is stopped: TLS would wait half a minute for a word."""
-    async with meeting(credentials=credentials_in(str(keys), DOOR)) as (made, where):
-        heard = threading.Event()
-
-        def talk(silent):
-            own = credentials_in(str(keys), "observer_ground")
-            secure = tls_context(own, ssl.Purpose.SERVER_AUTH)
-            with secure.wrap_socket(socket.create_connection(where)) as ground:
-                ground.sendall(UPGRADE)
-                assert ground.recv(100_000).startswith(b"HTTP/1.1 101 ")
-                heard.set()
-                silent()
-
-        with in_a_thread(talk):
-            await asyncio.to_thread(heard.wait)
-            async with asyncio.timeout(15):
-                await made.close()
-
-
-async def test_with_keys_a_silent_first_host_is_a_timeout(keys):
-    where = ("127.0.0.1", free_port())
-    listening = threading.Event()
-
-    def talk(silent):
-        secure = tls_context(credentials_in(str(keys), DOOR), ssl.Purpose.CLIENT_AUTH)
-        with socket.create_server(where) as server:
-            listening.set()
-            with secure.wrap_socket(server.accept()[0], server_side=True) as first:
-                first.recv(100_000)
-                silent()
-
-    with in_a_thread(talk):
-        await asyncio.to_thread(listening.wait)
-        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
-        async with asyncio.timeout(15):
-            with pytest.raises(TimeoutError):
-                await ground.ask()
-
-
-# ---- another run --------------------------------------------------------------------------------
 
 
 async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, monkeypatch):

@@ -73,8 +73,11 @@ def test_a_host_that_starts_is_waited_for():
     made.excuse(5.0, 5.0)  # it stood still
     assert made.look(5.0 + LINK.lost_after_s) == Changes()
     assert made.look(5.0 + LOST_S).lost == ("ground",)
-    ground = Side("ground")
-    assert ground.look(100.0) == Changes(lost=("",))  # only the first takes over
+    assert Side("ground").look(100.0) == Changes(lost=("",))  # only the first takes over
+    slow = Side("", rate=0.1)  # in slow motion it is waited for longer
+    slow.note_alive("ground", 0.0)
+    assert not slow.look(10 * LINK.lost_after_s).lost
+    assert slow.look(10 * LINK.lost_after_s + 0.01).lost
 
 
 def test_what_a_lost_host_ran_is_taken_over_with_incarnations_that_it_cannot_have_reached():
@@ -118,22 +121,15 @@ def over_a_line(made: Placement, is_cut: Callable[[float], bool], until_s: float
     return taken, back
 
 
-@pytest.mark.parametrize(("down_s", "up_s"), [(2.0, 5.5), (0.8, 3.0), (2.0, 9.0), (1.0, 20.0)])
+@pytest.mark.parametrize(("down_s", "up_s"), [(2.0, 5.5), (0.8, 3.0), (1.0, 20.0)])
 def test_over_a_line_that_comes_and_goes_little_is_moved_and_in_the_end_it_is_given_back(
         down_s, up_s):
     period_s, over_s = down_s + up_s, 300.0
     taken, back = over_a_line(
         robot(), lambda now_s: now_s < over_s and now_s % period_s > up_s, 400.0)
-    assert len(taken) == len(back)
-    assert len(taken) <= 5, "each time its modules have to detect all over again"
+    assert len(taken) == len(back) <= 5, "each time its modules have to detect all over again"
+    assert all(b - a >= 4.0 for a, b in zip(taken, back, strict=True)), "before they can have"
     assert over_s < back[-1] < over_s + 61.0
-
-
-@pytest.mark.parametrize("cut_s", [0.8, 1.5, 2.0, 3.0, 10.0])
-def test_what_was_taken_over_is_not_moved_again_before_it_can_have_found_out_what_is_wrong(cut_s):
-    (taken_s,), (back_s,) = over_a_line(robot(), lambda now_s: 5.0 < now_s < 5.0 + cut_s, 40.0)
-    assert back_s - taken_s >= 4.0
-    assert back_s <= max(taken_s + 4.1, 5.0 + cut_s + LINK.return_after_s + 0.1)
 
 
 def publish_table(made: Placement, now_s: float, *rows: NodeInfo) -> None:
@@ -171,15 +167,6 @@ def test_a_home_ends_its_superseded_process_and_starts_it_again_when_it_is_given
     assert ground.look(5.0).take == (), "an old table"
 
 
-def test_a_unit_that_runs_at_home_with_a_higher_incarnation_is_ended_here():
-    made = robot()
-    made.look(LOST_S)
-    made.note_alive("ground", 2.0)
-    made.take_table("ground", [row("hmi", 2 * EPOCH)], 2.0)
-    assert made.held == {"pilot", "modules"}
-    assert made.look(2.1) == Changes()
-
-
 def test_a_host_that_was_started_again_waits_until_its_units_are_given_back():
     ground = Side("ground")
     assert ground.begin([], lambda _node: True) == ["world"]
@@ -208,14 +195,6 @@ def test_an_incarnation_that_was_given_back_is_repeated_until_the_home_runs_a_hi
     assert made.given_back() == [("hmi", "ground", EPOCH + 1)]
     made.take_table("ground", [row("hmi", EPOCH + 2)], 1.1)
     assert made.given_back() == []
-
-
-@pytest.mark.parametrize(("rate", "times"), [(0.1, 10), (0.5, 2), (1, 1), (4, 1)])
-def test_in_slow_motion_others_are_waited_for_longer(rate, times):
-    made = Side("", rate=rate)
-    made.note_alive("ground", 0.0)
-    assert not made.look(times * LINK.lost_after_s).lost
-    assert made.look(times * LINK.lost_after_s + 0.01).lost
 
 
 @pytest.mark.parametrize("name", ["pilot", "router_a", "supervisor", "observer",

@@ -97,18 +97,6 @@ def test_what_is_sent_is_kept_and_told_as_kept_and_nothing_older_is(folder, watc
         record(2 * EPOCH, 6, b"own"), record(EPOCH + 1, 5))
 
 
-def test_a_copy_of_a_higher_incarnation_replaces_what_has_gone_on_here_meanwhile(folder, watched):
-    with store(folder) as made:
-        for number in range(50):
-            made.save(1, 0, b"cut off %d" % number)
-        watched.files.take("camera", record(EPOCH + 1, 11))
-        wait_until(lambda: watched.next()[1] == record(EPOCH + 1, 11), 10, "it was not kept")
-        made.save(1, 0, b"cut off")  # it runs on
-    newest, *older = read(folder, "camera", "r").records
-    assert newest == record(EPOCH + 1, 11)
-    assert all(other.generation < newest.generation for other in older)
-
-
 def test_a_damaged_file_is_told_once_and_what_comes_after_it_is_seen(folder, watched):
     folder.mkdir()
     (folder / "camera.1.1").write_bytes(b"no state" * 999)

@@ -8,7 +8,6 @@ from functools import partial
 from rampart.actors.bus.envelope import decode
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import ProgramEnd
-from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests.actors.supervision.test_supervisor import World, running
 from tests.virtual_time import within
@@ -83,20 +82,6 @@ async def test_a_node_of_a_recovery_module_waits_for_its_request(world):
     assert world.machine.forks == []
     assert [event for event in world.events if event[1] == "crashed"] == [
         (ARBITRATED, "crashed", 1)]
-
-
-@within(partial(running, Supervision(intensity=3, period_s=20.0), ["supervisor"]))
-async def test_too_many_ends_are_given_up_like_those_of_any_process(world):
-    node = Node(world, OWN)
-    for _ in range(100):
-        if world.row(OWN)[0] == "given up":
-            break
-        node.end_program()
-        await asyncio.sleep(0.2)
-    assert world.row(OWN)[0] == "given up"
-    assert node.starts == [2, 3, 4]
-    assert not node.process.killed
-    await eventually(lambda: node.starts[3:] == [5], 60.0)  # one attempt
 
 
 @within(arbitrated)

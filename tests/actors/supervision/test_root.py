@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -73,24 +72,6 @@ def port(run):
 
 @pytest.mark.processes
 @pytest.mark.alone
-async def test_the_next_supervisor_is_of_the_pool_and_there_within_thirty_milliseconds(
-        witness, port):
-    took = []
-    for _ in range(7):
-        there = await filled(port)
-        async with witness.comes_back("supervisor"):
-            old = process(port, "supervisor")
-            begun_s = time.monotonic()
-            os.kill(old, signal.SIGKILL)
-            while process(port, "supervisor") in {None, old}:
-                await asyncio.sleep(0.001)
-            took.append(time.monotonic() - begun_s)
-        assert process(port, "supervisor") in there
-    assert sorted(took)[len(took) // 2] < 0.03
-
-
-@pytest.mark.processes
-@pytest.mark.alone
 async def test_without_a_pool_the_next_supervisor_is_forked_and_no_node_is_started_twice(
         witness, port):
     there = await filled(port)
@@ -124,7 +105,7 @@ async def test_a_supervisor_that_dies_with_requests_under_way_leaves_one_process
 
 @pytest.mark.processes
 @pytest.mark.alone
-async def test_nodes_are_made_of_the_pool_and_one_without_a_spare_is_forked(witness, port):
+async def test_what_dies_is_made_of_the_pool_and_a_node_without_a_spare_is_forked(witness, port):
     there = await filled(port)
     async with witness.comes_back("safety_pilot"):
         os.kill(witness.pid("safety_pilot"), signal.SIGKILL)
@@ -133,6 +114,10 @@ async def test_nodes_are_made_of_the_pool_and_one_without_a_spare_is_forked(witn
         for name in ("DM1", "DM2"):  # together
             os.kill(witness.pid(name), signal.SIGKILL)
     assert {witness.pid("DM1"), witness.pid("DM2")} == there
+    there = await filled(port)
+    async with witness.comes_back("supervisor"):
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+    assert process(port, "supervisor") in there
 
 
 @pytest.mark.processes
@@ -203,17 +188,14 @@ async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path):
         document["node"][0].setdefault("parameters", {})["text"] = "x" * 400_000
         row = next(row for row in document["detection"] if row["name"] == "DM1")
         row.setdefault("parameters", {})["margin_m"] = 0.7
-        witness.publish(topics.ADAPTED_SYSTEM, AdaptedSystem(
-            1, "retune DM1", "me", msgspec.json.encode(document).decode()))
-        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        async with witness.comes_back("DM1"):
+            witness.publish(topics.ADAPTED_SYSTEM, AdaptedSystem(
+                1, "retune DM1", "me", msgspec.json.encode(document).decode()))
         there = await filled(port, there)
-        os.kill(witness.pid("DM2"), signal.SIGKILL)
-        await eventually(lambda: witness.state("DM2") == ("running", 2))
-        assert witness.pid("DM2") in there
-        os.kill(process(port, "supervisor"), signal.SIGKILL)
-        await eventually(lambda: witness.state("supervisor") == ("running", 2))
-        os.kill(witness.pid("DM3"), signal.SIGKILL)
-        await eventually(lambda: witness.state("DM3") == ("running", 2))
+        for victim in ("DM2", "supervisor", "DM3"):
+            async with witness.comes_back(victim):
+                os.kill(process(port, victim), signal.SIGKILL)
+            assert victim != "DM2" or witness.pid("DM2") in there
         titles = [e.reason for e in witness.errors[start:] if e.context == "started with"]
         assert titles == 3 * ["changed"]
 
@@ -263,9 +245,15 @@ async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped
 
 
 @pytest.mark.processes
-async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_not_known(tmp_path):
+async def test_a_stopped_watching_process_is_continued_and_without_it_the_verdict_is_not_known(
+        tmp_path):
     async with started(tmp_path) as (root, port):
-        os.kill(process(port, "run"), signal.SIGKILL)
+        described = {p.name for p in explain(systems.check(str(tmp_path / "stub.toml"))).processes}
+        assert {"+".join(p.names) for p in find_processes(port)} <= described
+        pid = process(port, "run")
+        os.kill(pid, signal.SIGSTOP)
+        await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)
+        os.kill(pid, signal.SIGKILL)
         out, err = await asyncio.to_thread(root.communicate, timeout=10)
     assert root.returncode == 4
     result = msgspec.json.decode(out.splitlines()[-1])
@@ -276,20 +264,7 @@ async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_
 
 
 @pytest.mark.processes
-async def test_a_stopped_watching_process_is_continued_and_explain_knows_all_processes(tmp_path):
-    async with started(tmp_path) as (root, port):
-        described = {p.name for p in explain(systems.check(str(tmp_path / "stub.toml"))).processes}
-        assert {"+".join(p.names) for p in find_processes(port)} <= described
-        pid = process(port, "run")
-        os.kill(pid, signal.SIGSTOP)
-        await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)
-        root.send_signal(signal.SIGTERM)
-        await asyncio.to_thread(root.communicate, timeout=10)
-    assert root.returncode in {1, 4}
-
-
-@pytest.mark.processes
-@pytest.mark.parametrize("at_s", [0.05, 0.6, 1.2])
+@pytest.mark.parametrize("at_s", [0.05, 0.8])
 async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
     async with started(tmp_path, at_s) as (root, port):
         root.send_signal(signal.SIGINT)

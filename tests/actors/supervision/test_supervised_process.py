@@ -37,24 +37,6 @@ def test_one_that_is_being_restarted_is_shown_as_what_it_was_and_never_as_well(b
     assert one.is_dead == (shown == "crashed")
 
 
-def test_restarts_are_granted_at_once_then_later_then_not_and_then_one_by_one():
-    one = process(State.CRASHED, intensity=4, period_s=10.0, backoff_s=1.0, backoff_max_s=1.5,
-                  attempt_s=20.0, attempt_max_s=30.0)
-    granted = []
-    for _ in range(4):
-        assert one.ask(0.0) == (Event.RESTART, "")
-        granted.append(one.delay_s)
-        one.policy.restarted(0.0)
-    assert granted == [0.0, 0.0, 1.0, 1.5]
-    assert one.ask(0.0) == (
-        Event.TOO_OFTEN, "4 restarts in 10 s, the next attempt is in 20 s")
-    one.policy.restarted(1.0)
-    assert one.ask(1.0) == (Event.TOO_OFTEN, "attempt 1 failed, the next attempt is in 30 s")
-    one.step(Event.TOO_OFTEN)
-    assert one.ask(2.0) == (Event.RESTART, "an attempt will follow by itself")
-    assert one.policy.attempts == 2  # to ask changes nothing while one is due
-
-
 def silence(one: SupervisedProcess, now_s: float) -> str:
     return one.silence(now_s, 1.0, lambda: AT_LEISURE)
 

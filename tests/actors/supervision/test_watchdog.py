@@ -23,8 +23,8 @@ class Device:
     """A pipe in the place of a watchdog device."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         os.mkfifo(path)
+        self.path = path
         self.fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         self.fed = b""
 
@@ -82,20 +82,19 @@ def waiting(notified: socket.socket) -> list[bytes]:
     return texts
 
 
-def run_of(tmp_path, device, *arguments):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    return RealRun(folder, "paper", "--watchdog", str(device.path), *arguments)
-
-
-def test_a_run_feeds_both_while_its_manager_is_replaced_and_disarms_the_device_at_its_end(
+def test_a_run_feeds_both_unless_root_and_supervisor_stand_and_disarms_the_device_at_its_end(
         tmp_path, device, notified):
-    with run_of(tmp_path, device) as run:
+    with RealRun(tmp_path, "paper", "--watchdog", str(device.path)) as run:
         assert notified.recv(100) == b"READY=1\nWATCHDOG=1"
         run.wait_for("running")
         device.is_fed()
         assert notified.recv(100) == b"WATCHDOG=1"
         run.kill("ftm_manager")
+        device.is_fed()
+        run.kill("supervisor", signal.SIGSTOP)
+        run.process.send_signal(signal.SIGSTOP)
+        assert device.starves(20)
+        run.process.send_signal(signal.SIGCONT)
         device.is_fed()
         waiting(notified)  # a full queue takes no more, and this test reads it only now
         run.process.send_signal(signal.SIGTERM)
@@ -107,41 +106,27 @@ def test_a_run_feeds_both_while_its_manager_is_replaced_and_disarms_the_device_a
     assert texts.count(b"STOPPING=1") == 1
 
 
-def test_a_manager_that_hangs_at_each_start_starves_them(tmp_path, device):
-    with run_of(tmp_path, device, "--fault", "hang:ftm_manager@2") as run:
+def test_a_manager_that_hangs_at_each_start_starves_them_and_a_killed_root_leaves_it_armed(
+        tmp_path, device):
+    with RealRun(tmp_path, "paper", "--watchdog", str(device.path), "--fault",
+                 "hang:ftm_manager@2") as run:
         run.wait_for("running")
         device.is_fed()
         assert device.starves(30)
         assert run.process.poll() is None
-
-
-def test_a_stopped_root_and_supervisor_starve_it_and_a_killed_root_leaves_it_armed(
-        tmp_path, device):
-    with run_of(tmp_path, device) as run:
-        run.wait_for("running")
-        device.is_fed()
-        run.kill("supervisor", signal.SIGSTOP)
-        run.process.send_signal(signal.SIGSTOP)
-        assert device.starves(20)
-        run.process.send_signal(signal.SIGCONT)
-        device.is_fed()
         run.process.kill()
         run.process.wait()
         wait_until(lambda: os.read(device.fd, 4096) == b"", 10, lambda: "the device is still open")
         assert b"V" not in device.fed
 
 
-def test_a_device_that_cannot_be_opened_is_one_line(tmp_path):
+def test_a_device_that_cannot_be_opened_and_one_in_virtual_time_are_one_line(tmp_path, refused):
+    assert "not with --virtual" in refused("run", "--virtual", "--watchdog", "/dev/null")
     done = subprocess.run(
         [sys.executable, "-m", "rampart.cli.run", "--no-hmi", "--watchdog", "/dev/nothing",
          "--report", str(tmp_path)], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "launch.py: --watchdog /dev/nothing: No such file or directory\n"
-
-
-def test_virtual_time_has_no_watchdog(capsys):
-    assert main(["run", "--virtual", "--watchdog", "/dev/null"]) == 2
-    assert "not with --virtual" in capsys.readouterr().err
 
 
 def test_the_unit_of_a_system_names_its_options(capsys):
@@ -159,6 +144,5 @@ def test_the_unit_of_a_system_names_its_options(capsys):
     (["paper", "--watchdog-s", "0.5"], "--watchdog-s 0.5: expected 1 to 3600"),
     (["paper", "--options='"], "No closing quotation"),
     (["paper", "--options=--nonsense"], "--nonsense: not an option")])
-def test_a_unit_that_could_not_start_is_refused(capsys, arguments, words):
-    assert main(["service", *arguments]) == 2
-    assert words in capsys.readouterr().err
+def test_a_unit_that_could_not_start_is_refused(refused, arguments, words):
+    assert words in refused("service", *arguments)
