@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rampart.cli.output import print_json, print_table, say, say_text
+from rampart.cli.output import print_json, print_table, say
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign import statistics
 from rampart.sim.campaign.named import NamedCampaign
@@ -45,8 +45,6 @@ def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCamp
         all_of_them = total(protected, "all")
         say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
             f"successful, {all_of_them.ineffective} without effect")
-    if (shared := statistics.seeds_in_words(runs)) and not named:
-        say_text(shared)
 
 
 def show_faults(groups: Mapping[str, Sequence[str]], *, as_json: bool) -> int:

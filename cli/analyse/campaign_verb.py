@@ -19,7 +19,7 @@ from rampart.cli.verbs import (
     whole,
     word,
 )
-from rampart.sim.campaign.defaults import PATIENCE_S, SEEDS
+from rampart.sim.campaign.defaults import PATIENCE_S
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
@@ -41,9 +41,8 @@ _CONDITIONS = (
     word("--network", "NAME", f"network model: {', '.join(NETWORKS)} (default: measured)",
          "measured"),
     whole("--seed", "N", "first seed (default: 1)", 1),
-    whole("--seeds", "N", "number of seeds: with --fault, runs of each fault (default: 1); with "
-          "--search (default: 1) and "
-          f"--runs (default: {SEEDS}), seeds among all runs"),
+    whole("--seeds", "N", "number of seeds: with --fault, runs of each fault; with --search, seeds "
+          "among all runs (default: 1)"),
     number("--patience", "S", "simulated seconds without progress after which a run fails "
            f"(default: {PATIENCE_S:g})", PATIENCE_S),
     number("--duration", "S", "simulated seconds of a run of a system without a mission "
@@ -118,8 +117,7 @@ def run(options: argparse.Namespace) -> int:
     --out. An interrupted campaign continues with the same command.
 
     Examples:
-      rampart campaign --runs 200                    # random single faults, 20 seeds
-      rampart campaign --runs 200 --seeds 200        # one seed per run; slower
+      rampart campaign --runs 200                    # random single faults
       rampart campaign --runs 200 --together 2       # random pairs of faults
       rampart campaign --fault 'kill:*' --seeds 5    # kill each process, five seeds
       rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both

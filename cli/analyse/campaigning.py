@@ -34,7 +34,6 @@ from rampart.cli.verbs import extra
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
-from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import (
     Job,
@@ -46,7 +45,6 @@ from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
 from rampart.sim.campaign.search import Space, margin, search, shrink
-from rampart.sim.campaign.statistics import seeds_in_words
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
@@ -148,8 +146,7 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
             jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
-            together=options.together, moments=_moments(spec, jobs[0]),
-            seeds=options.seeds or SEEDS)
+            together=options.together, moments=_moments(spec, jobs[0]))
     planned = list(_planned(options.fault, spec, fault_groups(spec)))
     together = options.together
     found = [(fault,) if fault else () for fault in planned] if together == 1 else [
@@ -218,7 +215,6 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
     unique = {job.key for job in jobs}
     done = len(unique & store.keys())
     unsafe = 0
-    tqdm.monitor_interval = 0  # its thread would keep a single worker, this process, from forking
     with tqdm(total=len(unique), initial=done, unit="run", file=sys.stderr, smoothing=0.05,
               mininterval=0.1 if sys.stderr.isatty() else _LOG_S) as bar:
 
@@ -274,7 +270,6 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
                   runs: Sequence[Run], named: NamedCampaign | None) -> Path:
     about = Campaign(
         title=named.title if named else "Fault-injection campaign", seed=options.seed,
-        note="" if named else seeds_in_words(runs),
         command=f"rampart {shlex.join(sys.argv[1:])}",
         section=named.section(spec, runs) if named else None)
     worst = {run.job.key: run_virtually(run.job) for run in worth_showing(runs)}

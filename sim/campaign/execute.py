@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from typing import NamedTuple
 
 import joblib
 
-from rampart.sim.campaign.branches import Attempt, attempt_together, together
-from rampart.sim.campaign.job import Job, RunResult
+from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.store import Store
 
 Progress = Callable[[Job, RunResult], None]
 
 
 class JobError(RuntimeError):
-    """A job could not be run; the message names it."""
+    """A job could not be run; the message names it, or says that a process was killed."""
+
+
+class Attempt(NamedTuple):
+    """Key of a job, and its result, or an error in one line."""
+
+    key: str
+    result: RunResult | None
+    error: str = ""
 
 
 def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0,
@@ -33,7 +42,7 @@ def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0,
         The number of runs made.
 
     Raises:
-        JobError: A job is invalid, or failed; all others were run.
+        JobError: A job is invalid, or failed, and all others were run; or a process was killed.
     """
     done = store.keys()
     waiting = {job.key: job for job in jobs if job.key not in done}
@@ -41,13 +50,16 @@ def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0,
         return 0
     count = 0
     failed = []
-    for key, result, error in _attempts(list(waiting.values()), workers):
-        if result is None:
-            failed.append(error)
-            continue
-        store.add(waiting[key], result)
-        count += 1
-        progress(waiting[key], result)
+    try:
+        for key, result, error in _attempts(list(waiting.values()), workers):
+            if result is None:
+                failed.append(error)
+                continue
+            store.add(waiting[key], result)
+            count += 1
+            progress(waiting[key], result)
+    except BrokenProcessPool as error:
+        failed.append(f"a process that made runs was killed: {' '.join(str(error).split())}")
     if failed:
         more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
         raise JobError(f"{failed[0]}{more}")
@@ -58,9 +70,15 @@ def _attempts(jobs: list[Job], workers: int) -> Iterator[Attempt]:
     """Yield the attempts of jobs as soon as possible."""
     count = min(workers or os.cpu_count() or 1, len(jobs))
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        for made in joblib.Parallel(
-                n_jobs=count, return_as="generator_unordered", batch_size=1,
-                pre_dispatch="2*n_jobs")(
-                    joblib.delayed(attempt_together)(group, os.getpid())
-                    for group in together(jobs, count)):
-            yield from made
+        yield from joblib.Parallel(
+            n_jobs=count, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(
+                joblib.delayed(_attempt)(job) for job in jobs)
+
+
+def _attempt(job: Job) -> Attempt:
+    """Make a run; an error is returned as text, since not all can be pickled."""
+    try:
+        return Attempt(job.key, run_job(job))
+    except Exception as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Attempt(job.key, None, f"run {job.key} ({job.text()}): {why}")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import time
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, TypeVar
@@ -107,7 +106,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         outcomes: Effects of the faults.
         failures: Actors that ended by an error.
         trace: Hash over all messages.
-        wall_s: Real duration; of a branch, from its fork.
+        wall_s: Real duration without loading.
         judged: Whether there was a judge; without one success and safety are meaningless.
         restarts: Number of restarts of all nodes.
     """
@@ -159,12 +158,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 
 def run_job(job: Job) -> RunResult:
     """Run a job in virtual time and return its result."""
-    begun_s = time.perf_counter()
-    return result_of(run_virtually(job), begun_s)
-
-
-def result_of(result: VirtualResult, begun_s: float) -> RunResult:
-    """Return the result of a run that began at a time of `time.perf_counter`."""
+    result = run_virtually(job)
     record, judged, injected_s = result.record, result.judgement, None
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
@@ -180,7 +174,7 @@ def result_of(result: VirtualResult, begun_s: float) -> RunResult:
                         for d in record.decisions),
         outcomes=record.faults,
         failures=tuple(f"{name}: {error}" for name, error in result.failures),
-        trace=result.trace, wall_s=round(time.perf_counter() - begun_s, 2))
+        trace=result.trace, wall_s=round(result.wall_s, 2))
 
 
 def run_virtually(job: Job) -> VirtualResult:

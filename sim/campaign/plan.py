@@ -13,7 +13,6 @@ from rampart.actors.bus.topic import ROOT
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import system_topics
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.job import Job
 from rampart.sim.faults.faults import PROCESS_FAULTS, Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
@@ -68,9 +67,9 @@ def cross(jobs: Sequence[Job], faults: Iterable[tuple[PlannedFault, ...]], seeds
 
 
 def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
-           faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S,
-           seeds: int = SEEDS) -> list[Job]:
-    """Return random runs: kind, fault, moment, duration and pattern are drawn.
+           faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S
+           ) -> list[Job]:
+    """Return random runs: kind, fault, moment, duration, pattern and seed are drawn.
 
     A kind is drawn first, weighted by the square root of its number of faults, then one of its
     faults. So ten faults of actuators are not lost among seven hundred of topics, nor as frequent.
@@ -82,10 +81,9 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
         groups: Names of faults by kind, see `fault_groups`.
         runs: Number of runs.
         faults: Of the robot: its named faults are of topics.
-        seed: Of the choice and of the runs; a longer sample begins with the shorter one.
+        seed: Of the choice; a longer sample begins with the shorter one.
         together: Number of faults per run.
         moments: Earliest and latest injection, simulated s.
-        seeds: Number of seeds: that many runs draw theirs, and the others reuse them in turn.
 
     Raises:
         ValueError: There are no jobs or no faults to choose from.
@@ -99,8 +97,7 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
         wrong = tuple(_random_fault(dice, groups, weights, faults, moments)
                       for _ in range(together))
         job = dice.choice(list(jobs))
-        of_run = dice.randrange(1, 2**31) if number < seeds else chosen[number % seeds].seed
-        chosen.append(_with(job, wrong, of_run))
+        chosen.append(_with(job, wrong, dice.randrange(1, 2**31)))
     return chosen
 
 

@@ -63,14 +63,12 @@ class Campaign:
         title: Of the page.
         command: As typed.
         seed: Of all random numbers.
-        note: Additional text.
         section: Section of a named campaign.
     """
 
     title: str
     command: str
     seed: int
-    note: str = ""
     section: Section | None = None
 
 

@@ -23,9 +23,6 @@ from rampart.sim.runs.report import NONE
 CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""
 
-FEW_SEEDS = 10
-"""With fewer seeds among many runs, an interval hardly covers effects of the seed."""
-
 NO_EFFECT = "no effect"
 """Verdict of a row in which no run counts."""
 
@@ -188,17 +185,6 @@ def as_json(row: Row) -> dict[str, object]:
     return {**options, **margins, **more, "success": row.success.count, "safe": row.safe.count,
             "success_interval": [row.success.low, row.success.high],
             "safe_interval": [row.safe.low, row.safe.high]}
-
-
-def seeds_in_words(runs: Sequence[Run]) -> str:
-    """Return a note on runs that share seeds; "" if each has its own."""
-    seeds = len({run.job.seed for run in runs})
-    if seeds == len(runs):
-        return ""
-    return (f"{count(len(runs), 'run')}, {count(seeds, 'seed')}: runs of one seed have noise and "
-            "delays in common, and under the same conditions are one run until the first fault. "
-            "The intervals take all runs for independent"
-            + (", which so few seeds do not bear out." if seeds < FEW_SEEDS else "."))
 
 
 def percent(share: float) -> str:

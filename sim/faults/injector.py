@@ -7,10 +7,9 @@ robot with further faults has a derived injector.
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -25,7 +24,6 @@ from rampart.actors.ftm.messages import ProcessEvent, SignalOrder
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.fault_watch import FaultWatch
 from rampart.actors.runtime.run_plan import SUPERVISOR
-from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, action_of
@@ -50,11 +48,6 @@ or `slow` (each message takes the third argument, in seconds; 0 ends it).
 """
 
 
-Branch = Callable[[int], bool]
-"""Decides whether this run continues with a scenario, given by its number from 0. It is called when
-the scenario departs from others with the same beginning."""
-
-
 def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
     """Return the nodes whose processes a fault may hit: all but the world, and the supervisor."""
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
@@ -67,8 +60,6 @@ class PlannedAction(msgspec.Struct, eq=False):
         planned: The fault.
         action: See `action_of`.
         watch: Reports, if the action is a tuple of orders.
-        scenario: Number of its scenario.
-        timer: Until its injection.
         injected_s: Simulated time of its injection, None before.
         hit: 1 if it has affected something that does not report, such as a process.
         reason: Why it has no effect, if it has none.
@@ -77,8 +68,6 @@ class PlannedAction(msgspec.Struct, eq=False):
     planned: PlannedFault
     action: object
     watch: FaultWatch
-    scenario: int = 0
-    timer: Timer | None = None
     injected_s: float | None = None
     hit: int = 0
     reason: str = ""
@@ -109,8 +98,7 @@ class Injector(Actor):
         ScenarioError: A planned fault is invalid in this system.
 
     Attributes:
-        planned: All planned faults; empty while the scenario is open.
-        open: Scenarios that the run may still become, by number.
+        planned: All planned faults.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT, ftm_topics.SIGNAL)
@@ -124,13 +112,11 @@ class Injector(Actor):
             self.hear_topic(event.key, self._signalled)
         self._control = processes
         self._nodes, self._known, self._faults = nodes, known, faults
-        self.open: dict[int, list[PlannedAction]] = {}
-        self._branch: Branch | None = None
         self._begun = 0
         self._ordered: list[PlannedAction] = []
         self.planned = self._plan(scenario)
 
-    def _plan(self, scenario: Sequence[PlannedFault], number: int = 0) -> list[PlannedAction]:
+    def _plan(self, scenario: Sequence[PlannedFault]) -> list[PlannedAction]:
         planned = []
         times = Counter(fault.fault for fault in scenario)
         for i, fault in enumerate(scenario, start=1):
@@ -138,7 +124,7 @@ class Injector(Actor):
             action = action_of(
                 fault, clip(name, NAME_CHARS), self._nodes, self._known, self._faults)
             planned.append(PlannedAction(
-                fault, action, FaultWatch(action if isinstance(action, tuple) else ()), number))
+                fault, action, FaultWatch(action if isinstance(action, tuple) else ())))
         self._may_publish.update(  # a robot has its own topics for faults
             order.topic.key for each in planned for order in each.watch.orders)
         return planned
@@ -147,45 +133,11 @@ class Injector(Actor):
         """Return the effects of the faults so far."""
         return tuple(fault.outcome() for fault in self.planned)
 
-    # -- one of several scenarios ---------------------------------------------------------------
-
-    def one_of(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch) -> None:
-        """Leave the scenario of this run open; call it before the start.
-
-        `branch` is called at the first fault of a scenario. If it returns true, the run is that
-        scenario, and no message shows that it was open before. Otherwise it is another one.
-
-        Raises:
-            ScenarioError: A planned fault is invalid in this system.
-        """
-        self.open = {i: self._plan(scenario, i) for i, scenario in enumerate(scenarios)}
-        self.planned = []
-        self._branch = branch
-
-    def decide(self, number: int) -> None:
-        """Decide whether this run is a scenario, unless that is known."""
-        if number not in self.open or self._branch is None:
-            return
-        faults = self.open.pop(number)
-        others = faults
-        if self._branch(number):
-            others = list(self._awaited())
-            self.planned = faults
-            self.open.clear()
-        for fault in others:
-            if fault.timer is not None:
-                fault.timer.cancel()
-
-    def _awaited(self) -> Iterable[PlannedAction]:
-        yield from self.planned
-        for faults in self.open.values():
-            yield from faults
-
     # -- when -----------------------------------------------------------------------------------
 
     def on_start(self) -> None:
         """Wait for the known times."""
-        for fault in self._awaited():
+        for fault in self.planned:
             if not fault.planned.goal:
                 self._later(fault, fault.planned.at_s - self.clock.now())
 
@@ -193,7 +145,7 @@ class Injector(Actor):
         """Note the number of goals that have begun; called by the injector of a robot."""
         while self._begun < number:
             self._begun += 1
-            for fault in self._awaited():
+            for fault in self.planned:
                 if fault.planned.goal == self._begun:
                     self._later(fault, fault.planned.at_s)
 
@@ -211,11 +163,7 @@ class Injector(Actor):
     # -- acting ---------------------------------------------------------------------------------
 
     def _later(self, fault: PlannedAction, delay_s: float) -> None:
-        delay_s = max(delay_s, 0.0)
-        if self.open:  # decide first, outside the mailbox, whose items are counted
-            asyncio.get_running_loop().call_at(
-                self.clock.source_time(self.clock.now() + delay_s), self.decide, fault.scenario)
-        fault.timer = self.call_later(delay_s, lambda: self._inject(fault))
+        self.call_later(max(delay_s, 0.0), lambda: self._inject(fault))
 
     def _inject(self, fault: PlannedAction) -> None:
         fault.injected_s = self.clock.now()

@@ -22,7 +22,7 @@ from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.system.layout import Layout
 from rampart.actors.web.page_plan import PagePlan
-from rampart.sim.faults.injector import INJECTOR, Branch, can_be_hit
+from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.record import RunRecord
@@ -49,7 +49,7 @@ class VirtualResult(msgspec.Struct, frozen=True):
         why: Why it ended.
         trace: SHA-256 over all messages, in hexadecimal.
         messages: Number of messages.
-        wall_s: Duration without loading; for a branch, with the common beginning.
+        wall_s: Duration without loading.
         failures: Actors that ended by an error, with the error's text.
         tracebacks: Their tracebacks.
     """
@@ -103,7 +103,7 @@ def _tap(take: Callable[[float, str, bytes], None], zero_s: float) -> Tap:
 
 
 class VirtualRun:
-    """One trial in virtual time. Use: `run` or `branches`, once.
+    """One trial in virtual time. Use: `run`, once.
 
     Args:
         trial: The trial; id, rate and ports of its plan are ignored.
@@ -138,28 +138,6 @@ class VirtualRun:
 
     def run(self) -> VirtualResult:
         """Run to the end on a new loop."""
-        result = self._on_loop()
-        if result is None:
-            raise RuntimeError("a run without branches has no result")
-        return result
-
-    def branches(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch
-                 ) -> VirtualResult | None:
-        """Run several scenarios with a common beginning, each with at least one fault.
-
-        Args:
-            scenarios: They replace the scenario of the constructor.
-            branch: Forks this process (`rampart.sim.virtual.virtual_loop.fork`) and returns true in
-                the child, which returns the result of that scenario.
-
-        Returns:
-            None in the process of the common beginning, after all branches.
-        """
-        self._scenario = tuple(scenarios[0])
-        return self._on_loop(scenarios, branch)
-
-    def _on_loop(self, scenarios: Sequence[Sequence[PlannedFault]] = (),
-                 branch: Branch | None = None) -> VirtualResult | None:
         # Loaded objects stay, and nearly all objects of a run are freed without the collector.
         gc.collect()
         gc.freeze()
@@ -167,13 +145,12 @@ class VirtualRun:
         gc.set_threshold(50_000, 20, 100)
         try:
             with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-                return runner.run(self._run(scenarios, branch))
+                return runner.run(self._run())
         finally:
             gc.set_threshold(*threshold)
             gc.unfreeze()
 
-    async def _run(self, scenarios: Sequence[Sequence[PlannedFault]],
-                   branch: Branch | None) -> VirtualResult | None:
+    async def _run(self) -> VirtualResult:
         begun_s = time.perf_counter()
         loop = asyncio.get_running_loop()
         if not isinstance(loop, VirtualLoop):
@@ -192,27 +169,17 @@ class VirtualRun:
 
         actors = self.trial.outside(
             context, machine.supervisor_heard, self._scenario, machine.hit, self._nodes)
-        injector = self.trial.injects
-        if branch is not None and injector is not None:
-            injector.one_of(scenarios, branch)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()
         why = None
         while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
             why = self.interrupted or self.trial.ended(clock.now())
-            if injector is not None and not (injector.planned or injector.open):
-                why = "all branches have departed"
-        if injector is not None:
-            for number in tuple(injector.open):  # their times never came
-                injector.decide(number)
         now_s = clock.now()
         machine.shut_down()
         for actor in actors:
             actor.stop()
         await asyncio.gather(*watching)
-        if injector is not None and not injector.planned:
-            return None
         record = self.trial.conclude(now_s, why or "ended")
         return VirtualResult(
             record, self.trial.judgement(record), why or "ended", trace.digest(), trace.messages,

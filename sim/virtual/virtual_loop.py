@@ -10,9 +10,7 @@ of them. Messages and ticks need no object: they are posted with two arguments a
 from __future__ import annotations
 
 import asyncio
-import os
 import selectors
-import warnings
 from collections.abc import Callable, Iterable
 from contextvars import Context
 from heapq import heapify, heappop, heappush
@@ -47,8 +45,8 @@ class _Call:
         return self._when
 
 
-class _Files(selectors.PollSelector):
-    """Files that the loop watches. Unlike an epoll, a poll is not shared after a fork.
+class _Files(selectors.DefaultSelector):
+    """Files that the loop watches.
 
     Attributes:
         count: Number of files; read after each timer, for which the selector's map is too slow.
@@ -187,23 +185,6 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _report(self, callback: Any, error: BaseException) -> None:
         self.call_exception_handler({
             "message": f"Exception in callback {callback!r}", "exception": error})
-
-
-def fork() -> int:
-    """Fork this process within a call of its virtual loop, which goes on in parent and child.
-
-    All that a virtual run consists of is memory: both have it, and it is the same run up to here.
-
-    Returns:
-        The child's process id; 0 in the child.
-    """
-    loop = asyncio.get_running_loop()
-    with warnings.catch_warnings():  # of numpy's idle threads, which are prepared for a fork
-        warnings.simplefilter("ignore", DeprecationWarning)
-        pid = os.fork()
-    if pid == 0:
-        asyncio._set_running_loop(loop)  # which asyncio takes away from a child
-    return pid
 
 
 class VirtualClock(Clock):
