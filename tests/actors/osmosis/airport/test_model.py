@@ -52,13 +52,7 @@ def test_a_footprint_is_in_the_prohibited_area_as_soon_as_one_corner_is():
     assert made.footprint_in_prohibited(rectangle(0.45, 10, 0.7, 0.72, 0.614))
 
 
-def test_a_sound_airport_has_no_problems():
-    assert findings(airport()) == []
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
+@pytest.mark.parametrize(("changes", "expected"), [
         ({"nodes": {}, "edges": ()}, "nodes: a graph needs at least one node"),
         ({"edges": (("SW", "XX"),)}, "edges[0]: unknown node"),
         ({"edges": (("SW", "SW"),)}, "edges[0]: expected two different nodes"),
@@ -72,36 +66,28 @@ def test_a_sound_airport_has_no_problems():
          "start: 15.7 m from the graph"),
         ({"lights": (Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
         ({"lights": (Light("L1", "L", 3, 3, 0),)}, "row.L1.nominal_cd: must be positive"),
-        ({"lights": (Light("L1", "L", 3, 3, 1), Light("L1", "L", 4, 3, 1))},
-         "row: duplicate name of a light"),
+        ({"lights": (Light("L1", "L", 3, 3, 1),) * 2}, "row: duplicate name of a light"),
+        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3),) * 2}, "obstacle: duplicate name"),
         ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 9),)}, "obstacle.o.radius_m: must be in"),
         ({"obstacles": (ObstaclePreset("o", "box", 3.2, 3, 0.3),)}, "obstacle.o: on the start"),
         ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3, gone_after_s=-1),)},
          "obstacle.o.gone_after_s: must not be negative"),
-        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3),) * 2},
-         "obstacle: duplicate name of an obstacle"),
         ({"allowed": shapely.Polygon()}, "surface: the airport needs pavement"),
-    ],
-)  # fmt: skip
+])
 def test_each_fault_of_an_airport_is_found_and_named(changes, expected):
+    assert findings(airport()) == []
     assert any(line.startswith(expected) for line in findings(airport(**changes)))
 
 
-@pytest.mark.parametrize(
-    ("goals", "expected"),
-    [
-        ((), "missions.M: a mission needs at least one goal"),
-        ((MissionGoal(3, 25, "taxi"),), "missions.M.goals[0]: 8.0 m from the graph"),
-        ((MissionGoal(7, 5, "taxi"), MissionGoal(6.4, 6.0, "taxi")),
-         "missions.M.goals[1]: in the prohibited area"),
-    ],
-)  # fmt: skip
-def test_each_fault_of_a_mission_is_found_and_named(goals, expected):
-    found = [f"{p.field}: {p.remedy}" for p in mission_problems(Mission("M", goals), airport())]
+SPLIT = (("SW", "SE"), ("NE", "NW"))
+
+
+@pytest.mark.parametrize(("goals", "edges", "expected"), [
+    ((), EDGES, "missions.M: a mission needs at least one goal"),
+    (((3, 25),), EDGES, "missions.M.goals[0]: 8.0 m from the graph"),
+    (((7, 5), (6.4, 6.0)), EDGES, "missions.M.goals[1]: in the prohibited area"),
+    (((17, 3), (17, 17)), SPLIT, "missions.M.goals[1]: not connected")])
+def test_each_fault_of_a_mission_is_found_and_named(goals, edges, expected):
+    mission = Mission("M", tuple(MissionGoal(x_m, y_m, "taxi") for x_m, y_m in goals))
+    found = [f"{p.field}: {p.remedy}" for p in mission_problems(mission, airport(edges=edges))]
     assert any(line.startswith(expected) for line in found)
-
-
-def test_a_goal_on_a_part_of_the_graph_without_connection_is_found():
-    made = airport(edges=(("SW", "SE"), ("NE", "NW")))
-    mission = Mission("M", (MissionGoal(17, 3, "taxi"), MissionGoal(17, 17, "taxi")))
-    assert [p.field for p in mission_problems(mission, made)] == ["missions.M.goals[1]"]

@@ -56,37 +56,23 @@ def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
     assert it.estimate(1.3) is None
 
 
-@pytest.mark.parametrize("pose", [
-    (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0),
-    *((absurd, absurd, -absurd) for absurd in (1e160, 1.7e308, -1.7e308))])
-def test_what_is_no_number_or_beyond_all_measure_changes_nothing(pose):
+@pytest.mark.parametrize(("stamp_s", "pose"), [
+    (None, (math.nan, 0.0, 0.0)), (None, (0.0, math.inf, 0.0)), (None, (1e160, 1e160, -1e160)),
+    *((stamp_s, (50.0, 60.0, 0.0)) for stamp_s in (1e9, 1.3, math.inf, math.nan))])
+def test_an_impossible_reading_changes_nothing_and_shuts_out_none(stamp_s, pose):
     it = DeadReckoning(3.0)
+    it.odometry(0.0 if stamp_s is None else stamp_s, pose, 0.0)
     straight(it, 0.0, 1.0)
     it.pose(0.9, (1.0, 2.0, 0.0), 1.0)
-    it.pose(1.0, pose, 1.0)
-    it.odometry(1.02, pose, 1.02)
+    it.pose(1.0 if stamp_s is None else stamp_s, pose, 1.0)
+    it.odometry(1.02 if stamp_s is None else stamp_s, pose, 1.02)
     straight(it, 1.04, 1.1)
     assert it.estimate(1.1) == pytest.approx((1.2, 2.0, 0.0))
+    it.pose(1.1, (1.3, 2.0, 0.0), 1.1)
+    assert it.estimate(1.1) == (1.3, 2.0, 0.0)
 
 
-WRONG_STAMPS = [1e9, 1.3, math.inf, math.nan]
-
-
-@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
-def test_what_has_no_possible_time_is_not_believed_and_shuts_out_none(stamp_s):
-    it = DeadReckoning(3.0)
-    it.odometry(stamp_s, (50.0, 0.0, 0.0), 0.0)
-    straight(it, 0.0, 1.0)
-    it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
-    it.odometry(stamp_s, (50.0, 0.0, 0.0), 1.01)
-    it.pose(stamp_s, (50.0, 60.0, 0.0), 1.05)
-    straight(it, 1.02, 2.0)
-    assert it.estimate(2.0) == pytest.approx((6.0, 6.0, 0.0))
-    it.pose(2.0, (6.1, 6.0, 0.0), 2.0)
-    assert it.estimate(2.0) == (6.1, 6.0, 0.0)
-
-
-@pytest.mark.parametrize("bridge_m", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("bridge_m", [0.0, math.nan, math.inf])
 def test_a_bound_that_is_none_is_refused(bridge_m):
     with pytest.raises(ValueError, match="bridge_m"):
         DeadReckoning(bridge_m)
@@ -113,7 +99,7 @@ def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves,
     assert math.remainder(found[2] - truth[2], math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("from_s", [2.0, 6.0, 12.0, 20.0])
+@pytest.mark.parametrize("from_s", [2.0, 12.0])
 def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(from_s):
     it, worst_m, bridged = DeadReckoning(3.0), 0.0, 0
     for now_s, item in disturbed([]):
@@ -140,7 +126,11 @@ def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(f
 def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
     """Also after a message from the future."""
 
-    async def scenario(system: System) -> list[tuple[float, float]]:
+    async def scenario() -> list[tuple[float, float]]:
+        async with System(system=shipped_system(), airport=AIRPORT) as system:
+            return await driven(system)
+
+    async def driven(system: System) -> list[tuple[float, float]]:
         commands = system.hear(topics.COMMAND)
         system.start("control", OsmosisControl, bridge_m=2.0)
         await system.settle()
@@ -164,11 +154,7 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
             assert i < 40 or seen[-1][0] > -1.0
         return seen
 
-    async def whole() -> list[tuple[float, float]]:
-        async with System(system=shipped_system(), airport=AIRPORT) as system:
-            return await scenario(system)
-
-    seen = run(whole)
+    seen = run(scenario)
     assert all(speed > 0.4 for gone_m, speed in seen if 0.3 < gone_m < 1.9)
     assert seen[-1][1] == 0.0
     assert 2.0 < seen[-1][0] < 2.8

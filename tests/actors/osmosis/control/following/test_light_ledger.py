@@ -42,7 +42,10 @@ def test_the_lights_of_a_row_are_those_that_it_passes_over():
 
 def test_a_measurement_is_sent_again_until_it_is_shown(ledger):
     ledger.add(measured("L1"), 0.0)
-    assert ledger.to_send_again(9.0) == []  # nobody has been heard
+    ledger.confirm(shown("L2", mission_id="y"))
+    assert ledger.judged == {"L1"}
+    assert ledger.to_send_again(9.0) == []  # nobody has been heard of this mission
+    assert ledger.detour(ledger.on_row(ROW), 10.0, ended=False) is None
     ledger.confirm(shown())
     assert ledger.to_send_again(0.4) == []  # it is on its way
     assert ledger.to_send_again(0.5) == [measured("L1")]
@@ -50,14 +53,6 @@ def test_a_measurement_is_sent_again_until_it_is_shown(ledger):
     assert ledger.to_send_again(1.0) == [measured("L1")]
     ledger.confirm(shown("L1"))
     assert ledger.to_send_again(9.0) == []
-
-
-def test_another_missions_status_shows_nothing(ledger):
-    ledger.add(measured("L1"), 0.0)
-    ledger.confirm(shown("L2", mission_id="y"))
-    assert ledger.judged == {"L1"}
-    assert ledger.to_send_again(9.0) == []
-    assert ledger.detour(ledger.on_row(ROW), 10.0, ended=False) is None
 
 
 def test_a_light_passed_without_a_measurement_is_gone_back_for_and_then_given_up(ledger):

@@ -27,41 +27,26 @@ def test_a_route_is_followed_within_0_3_m(route, yaw_rad):
     assert world.deviation(route) < 0.3
 
 
-@pytest.mark.parametrize("radius_m", [0.2, 0.35, 0.5, 0.65])
-def test_an_obstacle_exactly_on_the_line_is_passed(radius_m):
-    world = World(circles=[Circle(10.0, 0.0, radius_m)])
-    motion = drive(world, PathFollower(tuple(LINE)), 60, gate)
-    assert motion.arrived
-    assert world.least_clearance_m >= 0.25
-    assert world.deviation(LINE) <= 1.4
-    y = world.track[-1][1]
-    assert abs(y) < 0.05, "and the robot is back on the line"
-
-
-@pytest.mark.parametrize("offset_m", [-0.9, -0.4, -0.1, 0.1, 0.4, 0.9])
-def test_an_obstacle_beside_the_line_is_passed_on_the_other_side(offset_m):
-    world = World(circles=[Circle(10.0, offset_m, 0.4)])
-    assert drive(world, PathFollower(tuple(LINE)), 60, gate).arrived
-    assert world.least_clearance_m >= 0.25
-    beside = [y for x, y in world.track if abs(x - 10.0) < 0.3]
-    assert all(y * offset_m < 0 for y in beside)
-
-
 @pytest.mark.parametrize("circles", [
+    [Circle(10.0, 0.0, 0.2)], [Circle(10.0, 0.0, 0.65)], [Circle(1.26, 0.0, 0.4)],
+    [Circle(10.0, -0.4, 0.4)], [Circle(10.0, 0.9, 0.4)],
     [Circle(7.0, 0.0, 0.4), Circle(12.0, 0.0, 0.4)],
-    [Circle(7.0, 0.2, 0.4), Circle(10.0, -0.2, 0.4)],
     [Circle(7.0, 0.5, 0.4), Circle(9.5, -0.5, 0.4)],
     [Circle(7.0, 0.4, 0.3), Circle(7.0, -0.4, 0.3)],
-], ids=["in line", "close in line", "slalom", "abreast"])
-def test_two_obstacles_are_passed(circles):
+], ids=["small", "large", "close from the start", "right", "left", "two", "slalom", "abreast"])
+def test_obstacles_are_passed_and_the_robot_is_back_on_the_line(circles):
     world = World(circles=circles)
     assert drive(world, PathFollower(tuple(LINE)), 60, gate).arrived
     assert world.least_clearance_m >= 0.25
     assert world.deviation(LINE) <= 1.4
+    assert abs(world.track[-1][1]) < 0.05
+    if len(circles) == 1 and circles[0].y_m:
+        beside = [y for x, y in world.track if abs(x - 10.0) < 0.3]
+        assert all(y * circles[0].y_m < 0 for y in beside), "on the other side"
 
 
 @pytest.mark.parametrize("seed", [
-    0, 1, 2, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(3, 8))])
+    0, 1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(2, 8))])
 def test_random_obstacles_on_a_bent_route_are_passed(seed):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(-1.2, 1.2)
@@ -76,13 +61,6 @@ def test_random_obstacles_on_a_bent_route_are_passed(seed):
     assert drive(world, PathFollower(tuple(route)), 90, gate).arrived
     assert world.least_clearance_m >= 0.2
     assert world.deviation(route) <= 1.6
-
-
-@pytest.mark.parametrize("distance_m", [0.5, 0.7, 0.9, 1.2])
-def test_an_obstacle_that_is_close_from_the_start_is_still_passed(distance_m):
-    world = World(circles=[Circle(0.36 + distance_m + 0.4, 0.0, 0.4)])
-    assert drive(world, PathFollower(tuple(LINE)), 60, gate).arrived
-    assert world.least_clearance_m >= 0.25
 
 
 def test_a_closed_corridor_is_waited_for_and_gone_through_when_it_opens():

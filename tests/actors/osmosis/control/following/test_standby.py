@@ -70,20 +70,16 @@ def test_while_both_agree_the_active_one_drives_and_nothing_is_said():
     assert not bench.gate.standby_drives(bench.now)
 
 
-@pytest.mark.parametrize("standby", [None, (0.8, 0.1)])
-def test_a_silent_active_one_keeps_its_last_command_until_that_is_stale(standby):
-    bench = Bench().tick((0.8, 0.1), standby, ticks=20)
-    assert (bench.out, bench.reason) == ((0.8, 0.1), "")
-    assert bench.tick(ticks=8).out == (0.8, 0.1)
-    assert bench.tick(ticks=4).out == (0.0, 0.0)
-
-
 @pytest.mark.parametrize("bad", [(3.0, 0.0), (0.0, 9.0), (math.nan, 0.0)])
-def test_in_the_moment_in_which_the_active_ones_command_is_refused_the_standby_drives(bad):
+def test_when_the_active_ones_command_is_refused_the_standby_drives_until_it_is_good_again(bad):
     bench = Bench().tick((0.8, 0.0), (0.7, 0.0), ticks=20)
     bench.send("osmosis_control", bad)
     assert bench.out == (0.7, 0.0)
     assert bench.reason.startswith("standby drives: command")
+    bench.tick((0.8, 0.0), (0.7, 0.0), ticks=9)
+    assert bench.reason == "standby drives: osmosis control has just recovered"
+    bench.tick((0.8, 0.0), (0.7, 0.0), ticks=3)
+    assert (bench.out, bench.reason) == ((0.8, 0.0), "")
 
 
 def test_when_the_active_one_is_silent_for_four_periods_the_standby_drives():
@@ -91,15 +87,6 @@ def test_when_the_active_one_is_silent_for_four_periods_the_standby_drives():
     assert bench.tick(None, (0.7, 0.0), ticks=4).out == (0.8, 0.0)
     assert bench.tick(None, (0.7, 0.0)).out == (0.7, 0.0)
     assert bench.reason == "standby drives: no fresh command"
-
-
-def test_the_active_one_drives_again_when_it_has_been_good_for_half_a_second():
-    bench = Bench().tick((0.8, 0.0), (0.7, 0.0), ticks=20)
-    bench.tick((3.0, 0.0), (0.7, 0.0))
-    bench.tick((0.8, 0.0), (0.7, 0.0), ticks=9)
-    assert bench.reason == "standby drives: osmosis control has just recovered"
-    bench.tick((0.8, 0.0), (0.7, 0.0), ticks=3)
-    assert (bench.out, bench.reason) == ((0.8, 0.0), "")
 
 
 def test_a_source_that_stutters_does_not_take_the_wheel_back_between_two_bad_commands():
@@ -193,9 +180,8 @@ def test_a_standby_goes_back_where_the_active_one_does_and_stops_when_it_does():
     row = straight_row()
     row.adopt((15.0, 0.0), passing=False)
     assert row.back_to == pytest.approx((15.0, 0.0))
-    before = row.back_to
     row.adopt((15.1, 0.0), passing=False)
-    assert row.back_to is before or row.back_to == before
+    assert row.back_to == pytest.approx((15.0, 0.0))
     row.adopt(None, passing=False)
     assert row.back_to is None
 
@@ -232,7 +218,7 @@ def drive(loop, drag_radps, seconds, meant=lambda _t: 0.2, speed_mps=0.8):
     return rates, commands
 
 
-@pytest.mark.parametrize("drag_radps", [-0.7, -0.3, 0.3, 0.7])
+@pytest.mark.parametrize("drag_radps", [-0.7, 0.3])
 def test_a_constant_drag_is_compensated_up_to_the_dead_band(drag_radps):
     loop = MotionLoop(2.0)
     rates, _ = drive(loop, drag_radps, 8.0)
@@ -248,19 +234,14 @@ def test_with_a_healthy_base_next_to_nothing_is_added(meant):
     assert max(abs(c - meant(i * PERIOD_S)) for i, c in enumerate(commands)) < 0.05
 
 
-def test_a_robot_that_stands_winds_nothing_up():
+def test_a_robot_that_stands_winds_nothing_up_and_a_drag_that_is_over_is_unlearnt():
     loop = MotionLoop(2.0)
     for tick in range(100):
         loop.pose(tick * PERIOD_S, 1.0, 2.0, 0.5)
         loop.turn(0.8, 1.0, PERIOD_S)
     assert loop.added_radps == 0.0
-    drive(loop, -0.7, 4.0)
-    assert loop.turn(0.0, 0.0, PERIOD_S) == 0.0, "standstill is commanded as standstill"
-
-
-def test_a_drag_that_is_over_is_unlearnt():
-    loop = MotionLoop(2.0)
     drive(loop, -0.7, 6.0)
+    assert loop.turn(0.0, 0.0, PERIOD_S) == 0.0, "standstill is commanded as standstill"
     rates, _ = drive(loop, 0.0, 8.0)
     assert rates[-1] == pytest.approx(0.2, abs=DEAD_BAND_RADPS + 0.05)
 
