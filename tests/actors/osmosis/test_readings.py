@@ -68,28 +68,11 @@ def test_a_ray_is_an_echo_or_free_or_nothing():
 
 
 @pytest.mark.parametrize("range_m", NO_RAY)
-@pytest.mark.parametrize("bad", [LOWER, UPPER])
-def test_rays_that_mean_nothing_hide_no_echo_of_the_other_laser(bad, range_m):
-    sound = with_rays(full_sweep(8.0, 1), (90, 3.0))
-    wrong = full_sweep(range_m, 2)
-    view = view_of(wrong, sound) if bad == LOWER else view_of(sound, wrong)
-    assert (view.fault, nearest_m(view)) == ("", 3.0)
-
-
-@pytest.mark.parametrize("range_m", NO_RAY)
 @pytest.mark.parametrize("where", [slice(None), slice(85, 95), slice(0, 3), slice(-3, None), 90])
 def test_where_no_laser_knows_anything_there_is_no_view(where, range_m):
     wrong = with_rays(full_sweep(8.0, 1), (where, range_m))
     assert "no valid range" in view_of(wrong).fault
     assert "no valid range" in view_of(wrong, with_rays(full_sweep(8.0, 2), (where, -1.0))).fault
-
-
-def test_two_lasers_with_holes_in_different_places_make_a_whole_view():
-    lower = with_rays(full_sweep(8.0, 1), (slice(0, 90), 0.0), (120, 2.0))
-    upper = with_rays(full_sweep(8.0, 2), (slice(100, RAYS), math.nan), (30, 4.0))
-    view = view_of(lower, upper)
-    assert view.fault == ""
-    assert sorted(np.hypot(*view.points.T).round(3)) == [2.0, 4.0]
 
 
 def test_a_finer_laser_may_lose_rays_between_which_nothing_can_hide():

@@ -209,22 +209,6 @@ def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
     assert affected(sim) == 0
 
 
-@pytest.mark.parametrize("kind", [WEAK, BRAKE])
-def test_a_fault_that_leaves_everything_changes_no_bit(kind):
-    def states(*orders: m.ActuatorFault) -> list[bytes]:
-        sim = driving(1.0, 0.5)
-        for order in orders:
-            sim.order_fault(order)
-        seen = []
-        for step in range(30):
-            sim.command(1.0 - step % 3, step % 5 - 2.0)
-            sim.brake(step > 20)
-            seen.append(after(sim, 0.1)._data.qpos.tobytes())
-        return seen
-
-    assert states() == states(fault(kind, strength=1.0))
-
-
 # ---- bad input ----------------------------------------------------------------------
 
 BAD = [
@@ -292,26 +276,6 @@ def test_no_wheel_gets_more_than_a_healthy_one_and_only_faulty_wheels_get_less(
                 assert actuation.targets_radps[i] == targets[i]
 
 
-@settings(deadline=None)
-@given(st.lists(orders, max_size=4))
-def test_every_fault_ends_in_time_and_with_the_last_one_all_is_healthy(faults):
-    subject = ActuatorFaults(MOTOR)
-    until = {}
-    for order in faults:
-        subject.order(order, 5.0)
-        until[order.injection] = 5.0 + order.duration_s
-    for now_s in sorted(set(until.values())):
-        assert bool(subject)
-        subject.expire(now_s)
-    assert not subject
-    ended = [news.injection for news in subject.take_news() if news.finished]
-    assert sorted(ended) == sorted(until)
-    healthy = subject.actuate((9.0,) * 4, (1.0,) * 4, braking=False)
-    assert healthy.torques_nm == ((-30.0, 30.0),) * 4
-    assert healthy.targets_radps == (9.0,) * 4
-    assert not any(healthy.blocked)
-
-
 # ---- the actor ----------------------------------------------------------------------
 
 
@@ -339,14 +303,6 @@ def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_and_when_it_i
     bench.run(1.0, FORWARD)
     assert reports(bench)[2:] == [("f", 50, True, "")]
     assert bench.complaints == []
-
-
-def test_a_fault_that_is_over_while_the_simulator_is_held_up_is_reported_all_the_same():
-    bench = ordered(fault(STUCK, duration_s=20.0))
-    bench.run(0.1, FORWARD)
-    bench.now_s += 60.0
-    bench.actor.tick()
-    assert reports(bench)[-1][0::2] == ("f", True)
 
 
 def test_the_simulator_refuses_what_is_impossible_and_says_why():

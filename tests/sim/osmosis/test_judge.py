@@ -60,25 +60,11 @@ def test_a_point_not_reached_or_reached_in_the_wrong_mode_is_a_failure(timeline,
     assert len(judge.visit_times_s) == visited
 
 
-def test_points_out_of_order_do_not_count():
-    judge = Judge(GOALS)
-    for second, x_m in enumerate([30, 20, 10]):
-        judge.see(*sample(second, x_m, "TLT"[second]))
-    assert len(judge.visit_times_s) == 1
-
-
 @pytest.mark.parametrize(("offset_m", "visited"), [(1.09, 1), (1.11, 0)])
 def test_a_point_is_reached_within_the_arrival_radius(offset_m, visited):
     judge = Judge(GOALS[:1])
     judge.see(*sample(0, 10 + offset_m))
     assert len(judge.visit_times_s) == visited
-
-
-def test_a_wrong_mode_on_the_way_is_forgiven_if_the_point_is_reached_in_the_right_one_later():
-    judge = Judge(GOALS[:1])
-    judge.see(*sample(0, 10, "L"))
-    judge.see(*sample(1, 10, "T"))
-    assert judge.verdict().reasons == ()
 
 
 def test_a_collision_makes_unsafe_from_then_on_but_the_mission_may_succeed():
@@ -92,13 +78,6 @@ def test_a_collision_makes_unsafe_from_then_on_but_the_mission_may_succeed():
     judge = Judge(GOALS[:1])
     judge.see(*sample(0, 10, prohibited_s=0.02))
     assert judge.verdict().reasons == ("0.02 s in the prohibited area",)
-    assert not judge.verdict().safe
-
-
-def test_counters_that_start_anew_do_not_wash_clean():
-    judge = Judge(GOALS[:1])
-    judge.see(*sample(0, 0, collisions=2))
-    judge.see(*sample(1, 10, collisions=0))
     assert not judge.verdict().safe
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 
-import msgspec
 import pytest
 
 from rampart.actors.bus import messages as bm
@@ -20,17 +18,10 @@ from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import render
-from rampart.sim.runs.report import try_report
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")
 ACTIVE, IDLE = fm.DetectionState.ACTIVE, fm.DetectionState.IDLE
-
-
-def write_report(run: MissionRecord, directory):
-    html, data, problem = try_report(run, render, directory)
-    assert problem == ""
-    return html, data
 
 
 class Story:
@@ -190,33 +181,6 @@ def test_the_page_is_self_contained_escaped_and_shows_everything():
                  "track by localization", "not safe"):
         assert text in html
     assert "gone" not in html
-
-
-def test_both_files_are_written_whole_and_the_json_reads_back(tmp_path):
-    run = full_story().end()
-    html, data = write_report(run, tmp_path / "deep" / "er")
-    assert (html.name, data.name) == ("inspection-r1.html", "inspection-r1.json")
-    assert sorted(p.name for p in html.parent.iterdir()) == [html.name, data.name]
-    assert msgspec.json.decode(data.read_bytes(), type=MissionRecord) == run
-    assert json.loads(data.read_text())["mission"] == "success"
-
-
-def test_a_run_id_cannot_lead_out_of_the_directory(tmp_path):
-    html, _ = write_report(Story("../../etc/x y").end(), tmp_path)
-    assert html.parent == tmp_path
-
-
-def test_an_interrupted_write_leaves_the_old_report(tmp_path, monkeypatch):
-    html, _ = write_report(Story().end(), tmp_path)
-    before = html.read_text()
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.replace", fail)
-    assert "No space" in try_report(full_story().end(), render, tmp_path).problem
-    assert html.read_text() == before
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 # ---- a run that is resumed ------------------------------------------------------------

@@ -86,16 +86,6 @@ def test_a_controlled_stop_from_1_mps_takes_less_than_25_cm():
     assert abs(sim.truth().twist.linear_mps) < 0.005
 
 
-def test_the_brake_stops_in_a_shorter_way_whatever_is_commanded():
-    sim = run(world(), 1.0, 0.0, 3)
-    x0 = sim.pose[0]
-    sim.brake(True)
-    run(sim, 1.0, 0.0, 2)
-    assert 0.05 < sim.pose[0] - x0 < 0.18
-    assert abs(sim.truth().twist.linear_mps) < 0.005
-    assert sim.base_status().brake_engaged
-
-
 def test_a_braked_robot_stands_still_and_drives_again_when_released():
     sim = world()
     sim.brake(True)

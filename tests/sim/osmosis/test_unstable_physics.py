@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.osmosis.world import World
-from rampart.sim.runs.judge import Verdict
 from rampart.testing import virtual_run
 
 BLOWS_UP_S = 3.0
@@ -31,12 +29,6 @@ def test_a_run_whose_world_blows_up_ends_at_once_and_is_neither_safe_nor_a_succe
     assert (done.judgement.success, done.judgement.safe) == (False, None)
     assert done.record.duration_s < BLOWS_UP_S + 0.5
     assert done.record.reasons[0].startswith("physics unstable")
-
-
-@pytest.mark.usefixtures("blowing_up")
-def test_a_run_that_was_unsafe_before_stays_unsafe(monkeypatch):
-    monkeypatch.setattr(Judge, "verdict", lambda _judge: Verdict(success=False, safe=False))
-    assert virtual_run("paper", options={"mission": "A"}).record.safety == "unsafe"
 
 
 def test_a_run_whose_world_dies_is_neither_safe_nor_a_success(monkeypatch):

@@ -1,24 +1,27 @@
-"""A drive of the simulated robot, its sensors' readings, and what becomes of them under faults.
+"""A drive of the simulated robot under faults, and who reads its sensors.
 
 The world is driven open-loop, once for all tests: nothing that localization does changes the way.
-Faults act through the project's own gate, as they do in the nodes.
+Faults act through the project's own gate, as they do in the nodes. `watch` shows a drive to any
+number of onlookers at once: localization, the voted DM1 and DM8.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 from shapely.geometry import box
 
-from rampart.actors.bus import messages as bm
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
+from rampart.actors.osmosis.detection.area.estimation_error import EstimationMonitor
+from rampart.actors.osmosis.detection.area.voted_area import VotedPosition
 from rampart.actors.runtime.injection import FaultGate, Outgoing
 from rampart.sim.faults.disturbance import Fault
 from rampart.sim.osmosis.simulator import Schedule
@@ -82,9 +85,12 @@ def drive(seed: int = 1) -> tuple[Reading | Truth, ...]:
     rates = {**{t.key: t.rate_hz for t in SOURCES.values()}, topics.TRUTH.key: 20.0,
              "command": 20.0}
     schedule = Schedule(rates, 0.0, keep_s=1e9)
-    by_key = {t.key: t for t in SOURCES.values()}
+    readings = {topic.key: (topic, read) for topic, read in (
+        (topics.GPS, world.gps), (topics.IMU, world.imu), (topics.ODOMETRY, world.odometry),
+        (topics.BASE_STATUS, world.base_status),
+        (topics.ABSOLUTE_POSE, lambda: m.Pose(*world.pose)))}
     out: list[Reading | Truth] = []
-    for due_s, key in schedule.due(sum(leg[0] for leg in LEGS)):
+    for due_s, key in schedule.due(END_S):
         world.step_to(due_s)
         if key == "command":
             world.command(*_command(due_s))
@@ -93,7 +99,8 @@ def drive(seed: int = 1) -> tuple[Reading | Truth, ...]:
             out.append(Truth(due_s, t.pose.x_m, t.pose.y_m, t.pose.yaw_rad, t.twist.linear_mps,
                              t.twist.angular_radps))
         else:
-            out.append(Reading(by_key[key], due_s, _read(world, key)))
+            topic, read = readings[key]
+            out.append(Reading(topic, due_s, read()))
     return tuple(out)
 
 
@@ -103,18 +110,6 @@ def _command(now_s: float) -> tuple[float, float]:
             return linear_mps, angular_radps
         now_s -= lasts_s
     return 0.0, 0.0
-
-
-def _read(world: World, key: str) -> bm.Message:
-    if key == topics.GPS.key:
-        return world.gps()
-    if key == topics.IMU.key:
-        return world.imu()
-    if key == topics.ODOMETRY.key:
-        return world.odometry()
-    if key == topics.BASE_STATUS.key:
-        return world.base_status()
-    return m.Pose(*world.pose)
 
 
 def fault(name: str, *, on_s: float = 0.0, off_s: float = 0.0) -> Fault:
@@ -187,3 +182,131 @@ def with_absurd(items: Items, topic: Topic[Any], from_s: float
                         m.Pose(number, number, number), m.Twist(number, number)),
                     topics.ABSOLUTE_POSE: m.Pose(number, number, number)}[topic])
         yield now_s, item
+
+
+# ---- who reads it --------------------------------------------------------------------------------
+
+
+class Onlooker(Protocol):
+    def take(self, now_s: float, item: Reading | Truth) -> None: ...
+
+
+def watch(items: Items, *onlookers: Onlooker, to_s: float = math.inf) -> None:
+    for now_s, item in items:
+        if now_s > to_s:
+            break
+        for onlooker in onlookers:
+            onlooker.take(now_s, item)
+
+
+@dataclass
+class Located:
+    """The filter of localization, compared with the truth at 20 Hz."""
+
+    filter: PoseFilter = field(default_factory=PoseFilter)
+    start_s: float = 0.0
+    settle_s: float = 0.4
+    judge_to_s: float = math.inf
+    worst_m: float = 0.0
+    worst_rad: float = 0.0
+    lost_s: float = 0.0
+    bridged_m: float = 0.0
+    told: int = 0
+    excluded: set[str] = field(default_factory=set)
+
+    def take(self, now_s: float, item: Reading | Truth) -> None:
+        if now_s < self.start_s:
+            return
+        if isinstance(item, Reading):
+            take = {topics.IMU: self.filter.imu, topics.ODOMETRY: self.filter.odometry,
+                    topics.GPS: self.filter.gps, topics.ABSOLUTE_POSE: self.filter.absolute_pose,
+                    topics.BASE_STATUS: self.filter.encoders}
+            take[item.topic](item.stamp_s, item.body, now_s)
+        elif self.start_s + self.settle_s <= now_s <= self.judge_to_s:
+            self._compare(item, now_s)
+
+    def _compare(self, truth: Truth, now_s: float) -> None:
+        status, estimate = self.filter.status(now_s), self.filter.estimate()
+        self.excluded |= {name for name, _ in status.excluded}
+        self.bridged_m = max(self.bridged_m, status.bridged_m)
+        if estimate is None or now_s - estimate.stamp_s > 0.25:
+            self.lost_s += 0.05
+            return
+        self.told += 1
+        x_m, y_m, yaw_rad = truth.at(estimate.stamp_s)
+        found = estimate.pose
+        self.worst_m = max(self.worst_m, math.hypot(found.x_m - x_m, found.y_m - y_m))
+        self.worst_rad = max(self.worst_rad, abs(math.remainder(found.yaw_rad - yaw_rad, math.tau)))
+
+
+@dataclass
+class Voted:
+    """The voted DM1: its worst error beyond its bound, and how long it knew nothing."""
+
+    where: VotedPosition = field(default_factory=lambda: VotedPosition(0.05, 10.0, 5.0))
+    worst_m: float = 0.0
+    unknown_s: float = 0.0
+    seen_s: float = 0.0
+    looked_s: float = 0.0
+    truth: Truth | None = None
+
+    def take(self, now_s: float, item: Reading | Truth) -> None:
+        if isinstance(item, Truth):
+            self.truth = item
+            self.unknown_s = max(self.unknown_s, now_s - self.seen_s)
+            return
+        where, body, stamp_s = self.where, item.body, item.stamp_s
+        if item.topic is topics.IMU:
+            where.vote.track.imu(body, stamp_s, now_s)
+        elif item.topic is topics.ODOMETRY:
+            where.odometry(body, stamp_s, now_s)
+        elif item.topic is topics.GPS:
+            where.gps(body, stamp_s, now_s)
+        elif item.topic is topics.BASE_STATUS:
+            where.vote.see_encoders(body, stamp_s, now_s)
+        else:
+            where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s, body.yaw_rad)
+        if item.topic is topics.GPS or now_s - self.looked_s >= 0.1:
+            self._look(now_s)
+
+    def _look(self, now_s: float) -> None:
+        self.looked_s, found = now_s, self.where.look(now_s)
+        if found is None or self.truth is None:
+            return
+        (fix, stamp_s), self.seen_s = found, now_s
+        x_m, y_m, _ = self.truth.at(stamp_s)
+        off_m = math.dist((fix.x_m, fix.y_m), (x_m, y_m))
+        self.worst_m = max(self.worst_m, off_m - fix.accuracy_m)
+
+
+def honest(truth: Truth, _now_s: float) -> m.Pose | None:
+    return m.Pose(truth.x_m, truth.y_m, truth.yaw_rad)
+
+
+@dataclass
+class Accused:
+    """DM8 and a localization that says `lie` of the truth: when it was accused, (since s, to s)."""
+
+    lie: Callable[[Truth, float], m.Pose | None] = honest
+    monitor: EstimationMonitor = field(default_factory=lambda: EstimationMonitor(-math.inf))
+    spans: list[tuple[float, float]] = field(default_factory=list)
+
+    def take(self, now_s: float, item: Reading | Truth) -> None:
+        monitor = self.monitor
+        if isinstance(item, Truth):
+            said = self.lie(item, now_s)
+            if said is not None:
+                monitor.pose(said, now_s, now_s, "localization#1")
+        elif item.topic is topics.IMU:
+            monitor.vote.track.imu(item.body, item.stamp_s, now_s)
+        elif item.topic is topics.ODOMETRY:
+            monitor.vote.track.odometry(item.body, item.stamp_s, now_s)
+        elif item.topic is topics.BASE_STATUS:
+            monitor.vote.see_encoders(item.body, item.stamp_s, now_s)
+        elif item.topic is topics.GPS:
+            monitor.gps(item.body, item.stamp_s, now_s)
+        under_way = bool(self.spans) and self.spans[-1][1] == math.inf
+        if monitor.active and not under_way:
+            self.spans.append((now_s, math.inf))
+        elif under_way and not monitor.active:
+            self.spans[-1] = (self.spans[-1][0], now_s)

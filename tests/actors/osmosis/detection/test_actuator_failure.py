@@ -96,13 +96,6 @@ def test_a_finding_stays_a_while_after_the_last_evidence():
     assert not bench.run(1.0)
 
 
-def test_a_respawned_monitor_claims_nothing_before_it_knows():
-    monitor = ActuatorMonitor(LIMITS, known_after_s=0.3)
-    assert not monitor.known
-    monitor.expire(0.3)
-    assert monitor.known
-
-
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=30))
 def test_neighbours_that_turn_alike_are_never_accused(sides):
     bench = Bench()

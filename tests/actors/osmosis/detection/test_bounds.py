@@ -48,16 +48,6 @@ def test_bounds_timeline(events, expected):
     assert play(check, command(check), events) == expected
 
 
-@pytest.mark.parametrize(("events", "expected"), **table({
-    "it knows with the first command": (".v", "?-"),
-    "a bad one": (".V", "?A"),
-    "no command is no evidence": ("....", "??--"),
-}))
-def test_a_respawned_check_claims_nothing_before_it_knows(events, expected):
-    check = checker(known_after_s=0.2)
-    assert play(check, command(check), events) == expected
-
-
 @given(st.floats(), st.floats())
 def test_active_if_and_only_if_the_command_is_out_of_bounds(linear, angular):
     fault = beyond(linear, angular, 1.0, 2.0)

@@ -17,11 +17,10 @@ from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute, Rou
 from rampart.actors.osmosis.detection.mission_consistency import (
     ConsistencyLimits,
     ConsistencyMonitor,
-    MissionConsistency,
 )
 from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
 from rampart.testing import Ear, play, run, table, wake
-from tests.osmosis_system import System, in_system
+from tests.osmosis_system import System
 
 AIRPORT = load_airport("vallombre")
 GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))
@@ -61,11 +60,6 @@ def wrong(waypoints, _goal):
 def test_timeline_of_routes(events, expected):
     monitor = RouteMonitor(wrong, 0.5)
     assert expected == play(monitor, routes(monitor), events)
-
-
-def test_a_respawned_module_waits_for_a_route_before_it_says_anything():
-    monitor = RouteMonitor(wrong, 0.5, known_after_s=0.45)
-    assert play(monitor, routes(monitor), "........") == "????----"
 
 
 STATUS = m.MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), "")
@@ -231,15 +225,6 @@ def test_who_falls_silent_is_named(what, node):
     assert monitor.nodes == (f"{node}#1",)
 
 
-@pytest.mark.parametrize(("age_s", "nodes"), [(1.7, ()), (2.6, ("graph_planner#1",))])
-def test_content_that_is_old_is_as_good_as_none_and_a_shorter_delay_is_borne(age_s, nodes):
-    story = Story()
-    monitor, _ = watch(story, 1.0)
-    story.age_s = age_s
-    monitor, _ = watch(story, 8.0, monitor, 1.0)
-    assert monitor.nodes == nodes
-
-
 @pytest.mark.parametrize("first_pose", [(0.0, 20.0), (1e300, 20.0)])
 @pytest.mark.parametrize("tells", [True, False])
 def test_progress_that_stays_the_same_while_the_robot_drives_is_wrong(tells, first_pose):
@@ -305,20 +290,3 @@ def test_contradictions_that_do_not_last_are_none(changes):
         story.tell(monitor, now_s)
         assert not monitor.active
         now_s += 0.1
-
-
-@in_system()
-async def test_the_module_reports_what_the_monitor_finds(system):
-    ear = system.start("ear", Ear)
-    system.start("DM11", MissionConsistency, patience_s=1.0)
-    await system.settle()
-    story = Story()
-    story.change("mission", step=1)
-    for _ in range(8):
-        for topic, said in ((topics.MISSION_STATUS, story.mission),
-                            (topics.GOAL, story.goal), (topics.ROUTE, story.route),
-                            (topics.CONTROL_STATUS, story.control)):
-            system.say(topic, said, "mission_manager")
-        await asyncio.sleep(0.2)
-    assert ear.states == ["idle", "active"]
-    assert ear.heard[-1][1].nodes == ("mission_manager#1",)

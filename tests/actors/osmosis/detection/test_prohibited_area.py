@@ -19,11 +19,10 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
     half_diagonal_m,
     intrusion,
 )
-from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.lane import LANE
-from tests.osmosis_system import System, in_system, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05
@@ -162,15 +161,3 @@ def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system():
             assert room_m < 0.8
 
     run(scenario)
-
-
-@in_system(system=shipped_system())
-async def test_nonsense_on_the_command_is_reported_with_the_first_message(system):
-    ear = system.start("ear", Ear)
-    system.start("DM3", Bounds)
-    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
-    await system.settle()
-    assert ear.states == ["idle"]
-    system.say(topics.COMMAND, m.Twist(5.0, 0.0))
-    await system.settle()
-    assert ear.states == ["idle", "active"]

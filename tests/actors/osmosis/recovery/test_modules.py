@@ -8,15 +8,12 @@ import pytest
 
 from rampart.actors.bus.run_folder import EPOCH
 from rampart.actors.ftm import messages as fm
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
 from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
-from rampart.actors.runtime.parameters import read_parameters
-from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor, hang
+from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor
 from tests.osmosis_system import System, in_system
 
 # ---- RM1 ---------------------------------------------------------------------------------------
@@ -82,19 +79,6 @@ async def test_a_release_waits_for_the_brake_and_a_new_order_cancels_it(system, 
     assert base.engaged is ordered_again
     assert boss.phases[-1] == ("degraded" if ordered_again else "idle")
     assert boss.reports[-1].message.decision == (8 if ordered_again else 7)
-
-
-@in_system()
-async def test_a_status_from_before_the_order_confirms_nothing(system):
-    boss, base = await stopping(system, deaf=True)
-    await asyncio.sleep(0.55)
-    boss.order("RM1")
-    await system.settle()
-    status = m.BaseStatus(True, False, 0.0, (0.0,) * 4)
-    for stamp_s, phases in ((0.5, ["idle", "acting"]), (0.55, ["idle", "acting", "degraded"])):
-        base.publish(topics.BASE_STATUS, status, stamp=stamp_s)
-        await system.settle()
-        assert boss.phases == phases
 
 
 @pytest.mark.parametrize("engaged", [True, False])
@@ -240,20 +224,6 @@ async def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard(system
     assert system.incarnations["a"] == 2
 
 
-@in_system()
-async def test_a_hanging_node_is_killed_and_respawned(system):
-    boss, _ = await respawning(system)
-    await system.kill("a")
-    hanging = system.start("a", Node)
-    await asyncio.sleep(0.2)
-    hang(hanging)
-    await asyncio.sleep(0.4)
-    boss.order("RM3", nodes=("a",))
-    await asyncio.sleep(0.2)
-    assert boss.phases == ["idle", "acting", "done"]
-    assert system.incarnations["a"] == 3
-
-
 @pytest.mark.parametrize(("delay_s", "phases"), [
     (0.3, ["idle", "acting", "done"]), (0.05, ["idle", "acting", "done", "acting", "done"])])
 @in_system()
@@ -270,15 +240,6 @@ async def test_a_second_node_that_fails_is_respawned_too_and_who_is_well_left_al
     assert boss.phases == phases
     assert boss.reports[-1].message.reason == "a, b back"
     assert (system.incarnations["a"], system.incarnations["b"]) == (2, 2)
-
-
-@in_system()
-async def test_an_order_that_names_nobody_is_done_at_once(system):
-    boss, supervisor = await respawning(system)
-    boss.order("RM3")
-    await system.settle()
-    assert boss.phases == ["idle", "done"]
-    assert supervisor.requests == []
 
 
 @pytest.mark.parametrize("answer", ["refused", "given up"])
@@ -310,20 +271,6 @@ async def test_a_supervisor_that_is_away_is_asked_until_the_deadline(system):
 
 
 @in_system()
-async def test_a_release_while_acting_is_obeyed_when_the_node_is_back(system):
-    boss, _ = await respawning(system)
-    await system.kill("a")
-    boss.order("RM3", nodes=("a",))
-    await system.settle()
-    boss.release("RM3")
-    await system.settle()
-    assert boss.phases == ["idle", "acting"]
-    await asyncio.sleep(0.2)
-    assert boss.phases[-1] == "idle"
-    assert system.incarnations["a"] == 2
-
-
-@in_system()
 async def test_a_respawned_module_that_is_commanded_again_does_not_kill_who_is_well(system):
     boss, supervisor = await respawning(system)
     await system.kill("a")
@@ -339,9 +286,3 @@ async def test_a_respawned_module_that_is_commanded_again_does_not_kill_who_is_w
     assert boss.phases == ["idle", "acting", "done"]
     assert system.incarnations["a"] == 2
     assert len({r.request for _, r in supervisor.requests}) == 2
-
-
-@pytest.mark.parametrize("nodes", ["a", [], [1], [""]])
-def test_a_list_of_nodes_that_is_none_is_refused_by_name(nodes):
-    with pytest.raises(ValueError, match=r"RM3: x\.nodes.* = .*: expected a "):
-        read_parameters(Respawn.Parameters, {"nodes": nodes}, "RM3", "x")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.control.following.path_follower import PathFollower, field, repulsion
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
-from rampart.actors.osmosis.control.polyline import Polyline, wrap_angle
+from rampart.actors.osmosis.control.polyline import Polyline
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive
 
 LINE = [(0.0, 0.0), (20.0, 0.0)]
@@ -129,11 +129,3 @@ def test_repulsion_pushes_away_the_more_the_nearer_and_only_within_its_influence
 def test_the_field_never_turns_the_robot_about(y_m, x_m):
     x, _ = field(1.0, 0.0, np.array(((x_m, y_m),)), HULL)
     assert x > 0.0
-
-
-@given(st.floats(-50.0, 50.0))
-def test_a_wrapped_angle_is_the_same_direction(angle):
-    wrapped = wrap_angle(angle)
-    assert -math.pi < wrapped <= math.pi
-    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
-    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.bus.envelope import Header
-from rampart.actors.ftm.messages import RespawnRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import (
@@ -21,7 +20,6 @@ from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandP
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.actors.recovery.respawn import RespawnCore
 
 PERIOD_S = 0.05
 
@@ -61,13 +59,6 @@ class Bench:
     @property
     def reason(self):
         return self.gate.output(self.now).reason
-
-
-def test_while_both_agree_the_active_one_drives_and_nothing_is_said():
-    bench = Bench().tick((0.8, 0.1), (0.75, 0.2), ticks=20)
-    assert bench.out == (0.8, 0.1)
-    assert bench.reason == ""
-    assert not bench.gate.standby_drives(bench.now)
 
 
 @pytest.mark.parametrize("bad", [(3.0, 0.0), (0.0, 9.0), (math.nan, 0.0)])
@@ -267,17 +258,3 @@ def test_a_loop_that_only_listens_adds_what_the_other_does_until_that_is_silent(
     assert drive_on[-1] > 0.5 + 0.3
 
 
-# ---- the life that is accused -------------------------------------------------------------------
-
-
-def test_a_life_that_is_accused_by_its_number_is_respawned_though_it_is_well():
-    core = RespawnCore("RM", ("a",), first_request=100, start_s=0.0)
-    core.beat("a", 3, 1.0, 1.0)
-    assert core.order(["a#3"], 1.01, renewed=False)
-    assert core.take_requests() == [RespawnRequest(100, "a", 3, "RM")]
-    core.beat("a", 4, 1.1, 1.1)
-    assert core.back == ("a",)
-    later = RespawnCore("RM", ("a",), first_request=100, start_s=0.0)
-    later.beat("a", 4, 1.0, 1.0)
-    later.order(["a#2"], 1.01, renewed=False)
-    assert later.take_requests() == [RespawnRequest(100, "a", 3, "RM")], "life 4 is not accused"

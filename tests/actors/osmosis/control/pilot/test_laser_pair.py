@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 import msgspec
 import numpy as np
 import pytest
 
-from rampart.actors.ftm import messages as fm
-from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair, LaserReach
-from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.messages import LaserScan
-from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.osmosis_system import in_system, shipped_system
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2
@@ -98,16 +90,6 @@ def test_a_sweep_of_no_possible_time_is_no_view_and_shuts_out_none(laser, stamp_
         assert (bench.view.stamp_s, distances(bench.view)[0]) == (now_s, 3.0)
 
 
-@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
-def test_if_all_stamps_are_wrong_the_view_grows_old(stamp_s):
-    bench = Bench()
-    bench.feed(LOWER, healthy(0), 0.0)
-    for i in range(1, 10):
-        bench.feed(LOWER, healthy(i), stamp_s, i * PERIOD_S)
-        bench.feed(UPPER, healthy(i), stamp_s, i * PERIOD_S)
-    assert bench.view.stamp_s == 0.0
-
-
 @pytest.mark.parametrize("way", ["stuck", "biased"])
 def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
     bench = Bench()
@@ -177,20 +159,3 @@ def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
     bench.feed(LOWER, healthy(1), 0.0)
     bench.feed(LOWER, sweep((8, 8, 8, 8, 8), -1.0), PERIOD_S)
     assert "reference" in bench.view.fault
-
-
-@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
-@in_system(system=shipped_system())
-async def test_one_sweep_from_the_future_neither_blinds_the_pilot_nor_stops_it(system, stamp_s):
-    speeds = system.hear(topics.BASE_COMMAND)
-    system.start("safety_pilot", SafetyPilot)
-    await system.settle()
-    for i in range(80):
-        system.say(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "", 0))
-        system.say(topics.COMMAND, m.Twist(0.8, 0.0), "osmosis_control")
-        system.say(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
-                   stamp_s=stamp_s if i == 30 else None)
-        await asyncio.sleep(PERIOD_S)
-        if i == 58:
-            assert {heard.message.linear_mps for heard in speeds[-20:]} == {0.8}
-    assert speeds[-1].message.linear_mps == 0.0, "there is something in the way"

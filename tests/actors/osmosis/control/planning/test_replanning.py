@@ -123,17 +123,6 @@ def test_where_both_sides_are_blocked_it_comes_back_to_waiting_and_touches_nothi
     assert world.least_clearance_m >= 0.2
 
 
-def test_an_obstacle_that_goes_away_is_not_driven_round():
-    world = World(circles=[Circle(12.0, 0.0, 0.4)])
-
-    def go_away(now_s):
-        if now_s > 14.0:
-            world.circles.clear()
-
-    assert drive(world, row(), 60.0, each=go_away).arrived
-    assert max(abs(y) for _, y in world.track) < 0.05
-
-
 # ---- the planner as an actor --------------------------------------------------------------------
 
 
@@ -196,14 +185,6 @@ def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough():
     assert not passes(detour, CRATE)
     assert detour.waypoints[-1] == direct.waypoints[-1]
     assert detour.reason == "route around (-29.3, -5.0), which is blocked"
-
-
-def test_as_in_the_paper_it_does_not():
-    async def scenario(chain):
-        chain.blocked(*CRATE, for_s=500.0)
-        await asyncio.sleep(0.3)
-
-    assert len(planned(scenario)) == 1
 
 
 def test_the_place_is_avoided_for_later_goals_too_and_then_tried_again():

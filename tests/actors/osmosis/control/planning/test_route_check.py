@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from random import Random
 
-import numpy as np
 import pytest
 import shapely
 from hypothesis import given
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.osmosis.airport.route_check import CLEARANCE_M, RouteCheck
+from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.control.planning.closures import without
 from rampart.actors.osmosis.control.planning.route_search import plan_route
 
@@ -56,23 +55,6 @@ def test_so_is_every_way_round_something(start, goal, blocked):
         assert CHECK.fault(plan.waypoints, at(start), at(goal)) == ""
 
 
-@given(places(), places())
-def test_a_straight_way_to_the_goal_is_good_only_if_it_runs_along_the_graph_on_pavement(a, b):
-    robot, target = at(a), at(b)
-    line = shapely.LineString([robot, target])
-    graph = shapely.union_all([
-        shapely.LineString([AIRPORT.nodes[p], AIRPORT.nodes[q]]) for p, q in AIRPORT.edges])
-    if CHECK.fault((robot, target), robot, target) == "":
-        assert shapely.covers(AIRPORT.allowed, line)
-        clearance_m = shapely.distance(AIRPORT.allowed.boundary, line)
-        assert clearance_m >= CLEARANCE_M
-        for share in np.linspace(0, 1, 20):
-            point = line.interpolate(share, normalized=True)
-            near_end = min(math.dist(robot, (point.x, point.y)) / 12.5,
-                           math.dist(target, (point.x, point.y)) / 3.2)
-            assert near_end <= 1.0 or shapely.distance(graph, point) <= 2.0
-
-
 @given(places(), places(), st.integers(0, 10**6))
 def test_a_route_that_is_shifted_as_a_whole_is_noticed_by_its_end(start, goal, seed):
     draw = Random(seed)
@@ -111,11 +93,3 @@ def test_a_route_is_refused_with_the_leg_and_the_reason(case):
     found = fault(*waypoints, robot=robot, goal=goal)
     assert (found == "") == (expected == "")
     assert expected in found
-
-
-def test_a_graph_whose_edge_crosses_the_grass_is_noticed_by_the_route_over_it():
-    wrong = Airport("wrong", CORNER.nodes, (*CORNER.edges, ("A", "C")), PAVED,
-                    StartPose(0.0, 0.0, 0.0))
-    plan = plan_route(wrong.nodes, wrong.edges, (0.0, 0.0), (30.0, 27.0))
-    assert len(plan.waypoints) == 2
-    assert "crosses the prohibited area" in fault(*plan.waypoints, airport=wrong)

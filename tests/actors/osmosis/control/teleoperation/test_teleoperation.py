@@ -180,13 +180,6 @@ async def test_a_page_does_not_drive_while_the_joystick_is_held_and_is_told(tmp_
         assert (told.offender, "stick has the stick" in told.reason) == ("page", True)
 
 
-async def test_a_page_that_falls_silent_while_holding_stops_the_robot(tmp_path):
-    async with desk(tmp_path) as it:
-        it.page.publish(topics.JOYSTICK, m.Joystick(1.0, 0.0, True))
-        await it.until(lambda: it.page.commands == [m.Twist(1.0, 0.0), STOP])
-        await it.until(lambda: it.told("silent for 0.3 s"))
-
-
 async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_meanwhile(tmp_path):
     async with desk(tmp_path, device="later") as it:
         await it.until(lambda: it.told("waiting for the device"))
@@ -194,19 +187,6 @@ async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_mean
         await it.until(lambda: m.Twist(0.5, 0.0) in it.page.commands)
         (tmp_path / "later").symlink_to(tmp_path / "stick")
         await it.plug()
-
-
-async def test_in_virtual_time_no_device_is_opened(tmp_path):
-    os.mkfifo(tmp_path / "stick")
-    context = Context("teleoperation", 1, Clock(0.0), VirtualBus(Hub(), "teleoperation"),
-                      {"device": str(tmp_path / "stick")},
-                      RunContext(RunPlan(virtual=True), SPEC, application=with_joystick("")))
-    task = asyncio.create_task((node := Teleoperation(context)).run())
-    await asyncio.sleep(0.01)
-    with pytest.raises(OSError, match="No such device"):
-        os.open(tmp_path / "stick", os.O_WRONLY | os.O_NONBLOCK)
-    node.stop()
-    await task
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
