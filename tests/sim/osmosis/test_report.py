@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+import msgspec
 import pytest
 
 from rampart.actors.bus import messages as bm
@@ -18,6 +19,7 @@ from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import render
+from rampart.sim.runs.report import try_report
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")
@@ -93,52 +95,34 @@ def test_a_skipped_goal_is_not_reached():
     assert "step 1 at" not in page
 
 
-def test_a_crash_is_a_bar_from_the_event_to_the_respawn_and_a_restart():
-    story = Story()
-    crash = fm.ProcessEvent("hmi", "crashed", 7, 1, "supervisor", "SIGKILL")
-    story.tell(10.0, ftm_topics.PROCESS_EVENT, crash)
-    story.tell(10.5, ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "respawned", 8, 2, "RM4", ""))
-    run = story.end()
-    assert bars(run) == [("down", "hmi", 10.0, 10.5)]
-    assert run.restarts == {"hmi": 1}
-    assert [e.text for e in run.events] == [
-        "hmi crashed, incarnation 1: SIGKILL", "hmi respawned by RM4, incarnation 2"]
-
-
-def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end():
-    story = Story()
-    for t_s in (1.0, 1.2, 1.4):
-        story.detect(t_s, "DM2", ACTIVE, "stale")
-    story.detect(2.0, "DM2", IDLE)
-    story.detect(2.2, "DM2", IDLE)
-    story.detect(90.0, "DM1", ACTIVE, "grass")
-    assert bars(story.end(100.0)) == [
-        ("detection", "DM2", 1.0, 2.0), ("detection", "DM1", 90.0, 100.0)]
-
-
-def test_a_fault_of_a_topic_is_drawn_until_its_node_is_restarted_and_one_of_a_sensor_longer():
+def test_crashes_detections_and_faults_are_bars_from_their_begin_to_their_end():
     story = Story()
     story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", math.inf))
     for injection in ("i1", "gps-bias"):
         story.tell(5.0, bus_topics.INJECTION_REPORT, bm.InjectionReport(
             injection, "localization", 0, False, ""))
+    crash = fm.ProcessEvent("localization", "crashed", 7, 1, "supervisor", "SIGKILL")
+    story.tell(6.5, ftm_topics.PROCESS_EVENT, crash)
     story.tell(7.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
         "localization", "respawned", 9, 2, "RM4", ""))
-    assert bars(story.end(100.0)) == [
-        ("injection", "i1", 5.0, 7.0), ("injection", "gps-bias", 5.0, 100.0)]
-
-
-def test_an_injection_is_told_with_its_effect_whether_or_not_its_order_was_heard():
-    story = Story()
-    story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", 2.0))
-    for injection in ("i1", "command-not-updated-3f"):
-        for t_s, affected, finished in ((5.0, 0, False), (7.0, 40, True)):
-            story.tell(t_s, bus_topics.INJECTION_REPORT, bm.InjectionReport(
-                injection, "localization", affected, finished, ""))
-    texts = [e.text for e in story.end().events]
-    assert "fault injected: freeze localization/pose at localization" in texts
-    assert "injection over: freeze localization/pose at localization, 40 messages changed" in texts
-    assert "fault injected: command-not-updated-3f at localization" in texts
+    for t_s, name, state in ((11.0, "DM2", ACTIVE), (11.2, "DM2", ACTIVE), (12.0, "DM2", IDLE),
+                             (12.2, "DM2", IDLE), (90.0, "DM1", ACTIVE)):
+        story.detect(t_s, name, state, "why")
+    story.tell(95.0, bus_topics.INJECTION_REPORT, bm.InjectionReport(
+        "gps-bias", "localization", 40, True, ""))
+    run = story.end(100.0)
+    assert sorted(bars(run)) == [
+        ("detection", "DM1", 90.0, 100.0), ("detection", "DM2", 11.0, 12.0),
+        ("down", "localization", 6.5, 7.0),
+        ("injection", "gps-bias", 5.0, 95.0), ("injection", "i1", 5.0, 7.0)]
+    assert run.restarts == {"localization": 1}
+    texts = [event.text for event in run.events]
+    for text in ("localization crashed, incarnation 1: SIGKILL",
+                 "localization respawned by RM4, incarnation 2",
+                 "fault injected: freeze localization/pose at localization",
+                 "fault injected: gps-bias at localization",
+                 "injection over: gps-bias at localization, 40 messages changed"):
+        assert text in texts
 
 
 def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
@@ -153,8 +137,8 @@ def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
     assert (run.collisions, run.prohibited_s) == (1, 0.5)
 
 
-def full_story() -> Story:
-    story = Story()
+def full_story(run_id: str = "r1") -> Story:
+    story = Story(run_id)
     for i in range(200):
         story.truth(i * 0.5, -20 + i * 0.2, -18.5, obstacle_clearance_m=0.5)
         story.tell(i * 0.5, topics.POSE, m.Pose(-20 + i * 0.2, -18.5 + i * 0.05, 0.0))
@@ -181,6 +165,23 @@ def test_the_page_is_self_contained_escaped_and_shows_everything():
                  "track by localization", "not safe"):
         assert text in html
     assert "gone" not in html
+
+
+def test_both_files_are_written_whole_in_their_folder_or_the_old_ones_stay(tmp_path, monkeypatch):
+    run = full_story("../../etc/x y").end()
+    html, data, problem = try_report(run, render, tmp_path / "deep" / "er")
+    assert (problem, html.parent) == ("", tmp_path / "deep" / "er")
+    assert sorted(html.parent.iterdir()) == [html, data]
+    assert msgspec.json.decode(data.read_bytes(), type=MissionRecord) == run
+    before = html.read_text()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    assert "No space" in try_report(run, lambda _: "other", html.parent).problem
+    assert html.read_text() == before
+    assert len(list(html.parent.iterdir())) == 2
 
 
 # ---- a run that is resumed ------------------------------------------------------------

@@ -19,12 +19,7 @@ ROW = m.Goal(-22.0, -18.5, Mode.TAXI)
 
 
 def play(scenario):
-    async def scene(house):
-        house.request(DOWN, ROW)
-        await asyncio.sleep(5.0)
-        await scenario(house, house.base)
-
-    house.play(scene, parameters=house.FULL)
+    house.play(scenario, DOWN, ROW)
 
 
 def place(house):

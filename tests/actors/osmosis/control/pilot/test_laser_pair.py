@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
+import random
 
 import msgspec
 import numpy as np
 import pytest
 
-from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair, LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import (
+    LOWER,
+    UPPER,
+    LaserCheck,
+    LaserPair,
+    LaserReach,
+)
 from rampart.actors.osmosis.messages import LaserScan
+from rampart.sim.campaign.job import Job, run_job
+from rampart.sim.faults.scenario import parse_fault
+from tests.whole.missions import write_near_mission
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2
@@ -42,19 +52,10 @@ class Bench:
 
 def broken(way, i):
     """Return sweep and stamp of a laser with a fault, or None for silence."""
-    now_s = i * PERIOD_S
-    match way:
-        case "silent":
-            return None
-        case "stuck":
-            return sweep((8, 8, 8, 8, 8), 0.1), now_s
-        case "biased":
-            return sweep((8, 8, 3.5, 8, 8), 0.6), now_s
-        case "frozen":
-            return healthy(0, (8, 8, 8, 8, 8)), 0.0
-        case "late":
-            return healthy(i, (8, 8, 8, 8, 8)), now_s - 1.5
-    raise AssertionError(way)
+    now_s, free = i * PERIOD_S, (8, 8, 8, 8, 8)
+    return {"silent": None, "stuck": (sweep(free, 0.1), now_s), "frozen": (healthy(0, free), 0.0),
+            "biased": (sweep((8, 8, 3.5, 8, 8), 0.6), now_s),
+            "late": (healthy(i, free), now_s - 1.5)}[way]
 
 
 @pytest.mark.parametrize("bad", [LOWER, UPPER])
@@ -114,28 +115,22 @@ def test_of_lasers_that_differ_in_their_rays_all_echoes_count(first, other):
     assert len(bench.view.points) == 1 + len(other.ranges_f32) // 4
 
 
+LACKING = {
+    "empty": {"ranges_f32": b""}, "torn": {"ranges_f32": healthy(1).ranges_f32[:-1]},
+    "few rays": {"ranges_f32": healthy(1).ranges_f32[:8]}, "near": {"range_max_m": 0.3},
+    "no range": {"range_max_m": math.nan}, "endless": {"range_max_m": math.inf},
+    "turned": {"angle_min_rad": ANGLE_MIN + 0.06}, "nowhere": {"angle_min_rad": math.nan},
+    "behind": {"angle_min_rad": ANGLE_MIN - math.tau}, "narrow": {"angle_increment_rad": 0.01},
+    "wide": {"angle_increment_rad": 0.2}, "backwards": {"angle_increment_rad": -0.1}}
+
+
 def lacking(way, i):
     """Return a sweep that shows less than it should and looks like free space."""
-    sound = healthy(i, (8, 8, 8, 8, 8))
-    return msgspec.structs.replace(sound, **{
-        "empty": {"ranges_f32": b""}, "torn": {"ranges_f32": sound.ranges_f32[:-1]},
-        "few rays": {"ranges_f32": sound.ranges_f32[:8]},
-        "near": {"range_max_m": 0.3}, "no range": {"range_max_m": math.nan},
-        "endless": {"range_max_m": math.inf},
-        "turned": {"angle_min_rad": ANGLE_MIN + math.pi / 2},
-        "turned a little": {"angle_min_rad": ANGLE_MIN + 0.06},
-        "nowhere": {"angle_min_rad": math.nan}, "behind": {"angle_min_rad": ANGLE_MIN - math.tau},
-        "narrow": {"angle_increment_rad": 0.01}, "wide": {"angle_increment_rad": 0.2},
-        "backwards": {"angle_increment_rad": -0.1}, "on the spot": {"angle_increment_rad": 0.0},
-    }[way])
-
-
-WAYS = ["empty", "torn", "few rays", "near", "no range", "endless", "turned", "turned a little",
-        "nowhere", "behind", "narrow", "wide", "backwards", "on the spot"]
+    return msgspec.structs.replace(healthy(i, (8, 8, 8, 8, 8)), **LACKING[way])
 
 
 @pytest.mark.parametrize("bad", [LOWER, UPPER])
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", LACKING)
 def test_a_sweep_that_shows_less_than_it_should_hides_nothing_that_the_other_sees(way, bad):
     bench = Bench()
     for i in range(20):
@@ -145,7 +140,7 @@ def test_a_sweep_that_shows_less_than_it_should_hides_nothing_that_the_other_see
         assert distances(bench.view)[0] == 3.0
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", LACKING)
 def test_a_robot_with_one_laser_does_not_take_for_free_what_that_does_not_show(way):
     bench = Bench()
     bench.feed(LOWER, lacking(way, 1), 0.0)
@@ -159,3 +154,44 @@ def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
     bench.feed(LOWER, healthy(1), 0.0)
     bench.feed(LOWER, sweep((8, 8, 8, 8, 8), -1.0), PERIOD_S)
     assert "reference" in bench.view.fault
+
+
+# ---- a laser's check of itself -------------------------------------------------------------------
+
+
+def faults(*references):
+    check = LaserCheck()
+    return [check.fault(reference, i * PERIOD_S) for i, reference in enumerate(references)]
+
+
+def noise(count):
+    dice = random.Random(1)
+    return [0.1 + dice.gauss(0, 0.01) for _ in range(count)]
+
+
+def test_a_healthy_laser_is_believed_for_an_hour_and_one_without_a_reference_too():
+    assert set(faults(*noise(72_000))) == {""}
+    assert set(faults(*[-1.0] * 10)) == {""}
+
+
+def test_a_laser_that_repeats_itself_is_found_out_with_the_fourth_sweep():
+    found = faults(*noise(5), *[0.1] * 6)
+    assert found[:8] == [""] * 8
+    assert set(found[8:]) == {"the laser repeats itself"}
+
+
+@pytest.mark.parametrize("off_m", [0.5, -0.3, 0.1, math.nan, math.inf])
+def test_a_wrong_reference_is_found_out_at_once_and_not_believed_for_a_second(off_m):
+    found = faults(0.1 + off_m, *noise(40))
+    assert [bool(why) for why in found] == [True] * 20 + [False] * 21
+    assert found[0].startswith("the laser's reference is off by")
+
+
+@pytest.mark.parametrize("fault", ["laser-stuck@12+3", pytest.param(
+    "laser-dropout@12+3", marks=pytest.mark.slow)])
+def test_a_robot_that_cannot_trust_its_laser_stands_and_goes_on_when_it_can_again(tmp_path, fault):
+    mission = str(write_near_mission(tmp_path))
+    result = run_job(Job(row="x", system="paper", options={"mission": mission},
+                         faults=(parse_fault(fault),)))
+    assert result.effective
+    assert (result.safe, result.success) == (True, True)

@@ -65,16 +65,12 @@ def test_within_the_dead_zone_nothing_moves_and_beyond_it_begins_at_zero():
     assert forward(-32767) == 1.0
 
 
-def test_a_button_that_is_down_at_the_opening_is_no_press_until_it_was_let_go():
-    down = record(BUTTON | INITIAL, 4, 1)
+def test_only_a_press_counts_and_neither_the_first_state_nor_one_after_an_overflow():
+    down, up = record(BUTTON | INITIAL, 4, 1), record(BUTTON | INITIAL, 4, 0)
     assert not position(down).dead_man
     assert position(down, LET_GO, PRESS).dead_man
-
-
-def test_a_state_told_again_after_an_overflow_neither_presses_nor_releases():
-    again = record(BUTTON | INITIAL, 4, 1)
-    assert position(PRESS, again).dead_man
-    assert not position(PRESS, record(BUTTON | INITIAL, 4, 0)).dead_man
+    assert position(PRESS, down).dead_man
+    assert not position(PRESS, up).dead_man
 
 
 @pytest.mark.parametrize("kind", [0x00, 0x03, 0x80, 0xff])
@@ -100,11 +96,7 @@ def test_no_stream_of_records_leaves_the_range(records, zone, piece):
 
 @pytest.mark.parametrize(("parameters", "words"), [
     ({"dead_zone": 1.0}, "dead_zone = 1.0: expected a number, 0 or more, below 1"),
-    ({"dead_zone": "a"}, "dead_zone = 'a'"),
     ({"forward_sign": 2}, "forward_sign = 2: expected -1 or 1"),
-    ({"left_sign": [1]}, "left_sign = [1]: expected -1 or 1"),
-    ({"dead_man_button": -1}, "dead_man_button = -1: expected a whole number, 0 or more, at most"),
-    ({"dead_man_button": True}, "dead_man_button = True"),
     ({"left_axis": 1}, "left_axis = 1: expected another axis than forward_axis")])
 def test_a_mapping_without_sense_is_refused_by_name_and_value(parameters, words):
     with pytest.raises(ValueError, match=re.escape(words)):
