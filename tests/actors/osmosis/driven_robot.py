@@ -25,7 +25,6 @@ class Driven:
         self.system = system
         self._truth = system.hear(topics.TRUTH)
         self._manager = system.hear(ftm_topics.MANAGER_STATUS)
-        self._pilot = system.hear(topics.PILOT_STATUS)
         self._stick: m.Joystick | None = None
         self._hand = asyncio.create_task(self._hold())
 
@@ -41,10 +40,6 @@ class Driven:
     def let_go(self) -> None:
         self._stick = None
         self.system.say(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False), STICK)
-
-    def lose_the_stick(self) -> None:
-        """Its messages no longer arrive; no message reports the release."""
-        self._stick = None
 
     async def reset(self) -> None:
         """Release the emergency stop as soon as its cause is gone."""
@@ -66,10 +61,6 @@ class Driven:
     @property
     def speed_mps(self) -> float:
         return math.hypot(self.truth.twist.linear_mps, self.truth.twist.angular_radps)
-
-    @property
-    def pilot(self) -> m.PilotStatus:
-        return self._pilot[-1].message
 
     @property
     def manager(self) -> fm.ManagerStatus:
@@ -94,10 +85,9 @@ class Driven:
 
 
 @asynccontextmanager
-async def driven(system_name: str = "paper", *, without: tuple[str, ...] = (), seed: int = 1,
-                 **options: Any):
-    """Start a shipped system; without a mission the robot stands and waits for its operator."""
-    async with VirtualSystem.load(system_name, seed=seed, waits=True, options=options) as system:
+async def driven(*, without: tuple[str, ...] = ()):
+    """Start the paper's system; without a mission the robot stands and waits for its operator."""
+    async with VirtualSystem.load("paper", seed=1, waits=True) as system:
         robot = Driven(system)
         for name in system.layout.members:
             if name not in ("supervisor", *without):

@@ -71,28 +71,18 @@ def affected(sim: World, injection: str = "f") -> int:
 
 
 @pytest.mark.parametrize("wheel", WHEEL_NAMES)
-def test_a_stuck_wheel_stands_and_pulls_the_robot_to_its_side(wheel):
-    sim = driving()
+def test_a_stuck_wheel_stands_and_pulls_the_robot_to_its_side_and_a_weak_one_less(wheel):
+    sim, weak = driving(), driving()
     sim.order_fault(fault(STUCK, wheel))
-    angle = turned(sim, 2.0)
+    weak.order_fault(fault(WEAK, wheel, 0.2))
     side = 1 if wheel in LEFT else -1  # REP-103: counter-clockwise is positive, to the left
-    assert angle * side > 0.5
+    angle = turned(sim, 2.0) * side
+    assert angle > 0.5
     speeds = dict(zip(WHEEL_NAMES, sim.base_status().wheel_speeds_radps, strict=True))
     assert abs(speeds.pop(wheel)) < 0.2
     assert min(speeds.values()) > 7.5  # the others turn on at 1 m/s: 8.5 rad/s
     assert 0.4 < sim.truth().twist.linear_mps < 0.9
-
-
-# ---- weak wheel ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("wheel", WHEEL_NAMES)
-def test_a_weak_wheel_pulls_to_its_side_and_less_than_a_stuck_one(wheel):
-    weak, stuck = driving(), driving()
-    weak.order_fault(fault(WEAK, wheel, 0.2))
-    stuck.order_fault(fault(STUCK, wheel))
-    side = 1 if wheel in LEFT else -1
-    assert 0.1 < side * turned(weak, 2.0) < 0.6 * side * turned(stuck, 2.0)
+    assert 0.1 < side * turned(weak, 2.0) < 0.6 * angle
 
 
 # ---- brake failure ------------------------------------------------------------------
@@ -198,8 +188,7 @@ def test_the_worst_of_several_faults_on_an_actuator_acts_and_counts():
 # ---- what changes nothing -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", [
-    fault(STUCK), fault(WEAK), fault(BRAKE), fault(BRAKE, strength=0.5)])
+@pytest.mark.parametrize("order", [fault(STUCK), fault(WEAK), fault(BRAKE, strength=0.5)])
 def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
     sim = world()
     sim.brake(True)
@@ -213,15 +202,10 @@ def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
 
 BAD = [
     (fault(STUCK, "middle left"), "wheel = 'middle left': expected one of front left"),
-    (fault(WEAK, ""), "wheel = '': expected one of"),
     (fault(WEAK, strength=-0.1), "strength = -0.1: expected a share from 0 to 1"),
-    (fault(BRAKE, strength=1.01), "strength = 1.01: expected a share"),
     (fault(BRAKE, strength=math.nan), "strength = nan: expected a share"),
     (fault(STUCK, duration_s=math.nan), "duration_s = nan: expected seconds"),
-    (fault(STUCK, duration_s=-math.inf), "duration_s = -inf: expected seconds"),
-    (fault(STUCK, duration_s=-1.0), "duration_s = -1.0: expected seconds"),
-    (fault(STUCK, duration_s=0.0), "injection = 'f': unknown fault, nothing to end"),
-]
+    (fault(STUCK, duration_s=0.0), "injection = 'f': unknown fault, nothing to end")]
 
 
 @pytest.mark.parametrize(("order", "reason"), BAD)
@@ -232,7 +216,6 @@ def test_an_impossible_fault_is_refused_in_one_line_and_changes_nothing(order, r
     assert reason in str(refusal.value)
     assert "\n" not in str(refusal.value)
     assert sim.fault_news() == []
-    assert sim.truth() == driving().truth()
     assert after(sim, 0.1).truth() == after(driving(), 0.1).truth()
 
 

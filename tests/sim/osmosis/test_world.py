@@ -64,9 +64,6 @@ def test_the_same_seed_gives_the_same_world_bit_for_bit_and_another_seed_another
     assert first != record(2)
 
 
-# ---- dead man -----------------------------------------------------------------------
-
-
 # ---- prohibited area ----------------------------------------------------------------
 
 
@@ -104,6 +101,9 @@ def test_backing_off_and_hitting_again_is_a_second_collision():
         sim.command(linear, 0.0)
         sim.step_to(sim.time_s + 4.0)
     assert sim.truth().collisions == 2
+    after = world(start_s=20.0, kept=sim.keep())
+    after.step_to(20.1)
+    assert after.truth().collisions >= 2, "a resumed run goes on counting"
 
 
 # ---- obstacles ----------------------------------------------------------------------
@@ -153,15 +153,9 @@ def test_a_removed_preset_does_not_come_by_itself_but_can_be_put_back():
     assert names(sim) == {"drum"}
 
 
-@pytest.mark.parametrize(
-    ("place", "expected"),
-    [
-        ((0.5, 0.0, 0.3), "on the robot"),
-        ((math.nan, 0.0, 0.3), "must be finite"),
-        ((5.0, 0.0, 0.0), "radius_m: 0: must be in 0.05 to 5 m"),
-        ((5.0, 0.0, 50.0), "radius_m: 50: must be in 0.05 to 5 m"),
-    ],
-)
+@pytest.mark.parametrize(("place", "expected"), [
+    ((0.5, 0.0, 0.3), "on the robot"), ((math.nan, 0.0, 0.3), "must be finite"),
+    ((2e6, 0.0, 0.3), "must be within"), ((5.0, 0.0, 50.0), "radius_m: 50: must be in")])
 def test_an_impossible_obstacle_is_refused(place, expected):
     sim = world()
     with pytest.raises(WorldError, match=expected):
@@ -224,23 +218,9 @@ def test_a_world_goes_on_as_it_was_left():
     assert (after.truth().collisions, after.truth().prohibited_s) == (0, 0.0)
 
 
-def test_collisions_go_on_counting():
-    sim = world()
-    sim.command(1.0, 0.0)
-    sim.add_obstacle("crate", 3.0, 0.0, 0.4)
-    sim.step_to(4.0)
-    assert sim.truth().collisions > 0
-    after = world(start_s=5.0, kept=sim.keep())
-    after.step_to(5.1)
-    assert after.truth().collisions >= sim.truth().collisions
-
-
-def test_a_kept_world_that_makes_no_sense_is_refused():
+def test_what_makes_no_sense_is_refused():
     kept = msgspec.structs.replace(world().keep(), pose=(math.nan, 0.0, 0.0))
     with pytest.raises(StateError, match="not finite"):
         WORLD_STATE.decode(1, WORLD_STATE.encode(kept))
-
-
-def test_a_time_that_is_not_finite_is_refused():
     with pytest.raises(WorldError, match="time must be finite"):
         world().step_to(math.nan)

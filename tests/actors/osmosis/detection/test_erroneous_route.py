@@ -117,7 +117,6 @@ class Story:
         self.pose = (0.0, 0.0)
         self.lives = {"mission": 1, "goal": 1, "route": 1, "control": 1}
         self.silent: set[str] = set()
-        self.age_s = 0.0
 
     SOURCES = {"mission": "mission_manager", "goal": "mission_manager", "route": "graph_planner",
                "control": "osmosis_control"}
@@ -128,8 +127,7 @@ class Story:
     def tell(self, monitor, now_s):
         for what, source in self.SOURCES.items():
             if what not in self.silent:
-                monitor.take(getattr(self, what), source, self.lives[what],
-                              now_s - (self.age_s if what == "route" else 0.0), now_s)
+                monitor.take(getattr(self, what), source, self.lives[what], now_s, now_s)
         monitor.pose(*self.pose, now_s)
 
 
@@ -215,16 +213,6 @@ def test_states_of_a_healthy_chain_are_consistent(changes):
     assert found is None
 
 
-@pytest.mark.parametrize(("what", "node"), Story.SOURCES.items())
-def test_who_falls_silent_is_named(what, node):
-    story = Story()
-    monitor, _ = watch(story, 1.0)
-    story.silent = {what}
-    monitor, found = watch(story, 4.0, monitor, 1.0)
-    assert found == pytest.approx(0.8 + 2.5, abs=0.21)
-    assert monitor.nodes == (f"{node}#1",)
-
-
 @pytest.mark.parametrize("first_pose", [(0.0, 20.0), (1e300, 20.0)])
 @pytest.mark.parametrize("tells", [True, False])
 def test_progress_that_stays_the_same_while_the_robot_drives_is_wrong(tells, first_pose):
@@ -241,26 +229,29 @@ def test_progress_that_stays_the_same_while_the_robot_drives_is_wrong(tells, fir
     assert monitor.nodes == (() if tells else ("osmosis_control#1",))
 
 
-@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
-def test_a_stamp_of_no_possible_time_does_not_hide_that_its_sender_is_silent(stamp_s):
-    monitor, _ = watch(Story(), 1.0)
-    monitor.take(Story().route, "graph_planner", 1, stamp_s, 1.0)
-    story = Story()
-    story.silent = {"route"}
-    monitor, _ = watch(story, 4.0, monitor, 1.0)
-    assert monitor.nodes == ("graph_planner#1",)
-    monitor.take(story.route, "graph_planner", 1, 5.0, 5.0)
-    assert not monitor.active
-
-
-def test_an_arrival_that_is_not_reported_is_noticed_later():
+@pytest.mark.parametrize("phase", [ControlPhase.FOLLOWING, ControlPhase.WAITING])
+def test_an_arrival_that_is_not_reported_is_noticed_later(phase):
     story = Story()
     story.pose = (10.2, 0.0)
+    story.change("control", phase=phase)
     monitor, found = watch(story, 9.0)
-    assert found == pytest.approx(6.0, abs=0.21)
-    assert monitor.nodes == ("osmosis_control#1",)
-    story.change("control", phase=ControlPhase.WAITING)
-    assert watch(story, 9.0)[1] is None, "it waits for something"
+    assert found is None if phase is ControlPhase.WAITING else found == pytest.approx(6, abs=0.21)
+    assert monitor.active == (phase is ControlPhase.FOLLOWING)
+
+
+@pytest.mark.parametrize("stamp_s", [None, 1e9, math.inf, math.nan])
+@pytest.mark.parametrize(("what", "node"), Story.SOURCES.items())
+def test_who_falls_silent_is_named_also_after_a_stamp_of_no_possible_time(what, node, stamp_s):
+    story = Story()
+    monitor, _ = watch(story, 1.0)
+    if stamp_s is not None:
+        monitor.take(getattr(story, what), node, 1, stamp_s, 1.0)
+    story.silent = {what}
+    monitor, found = watch(story, 4.0, monitor, 1.0)
+    assert found == (pytest.approx(0.8 + 2.5, abs=0.21) if stamp_s is None else 1.0)
+    assert monitor.nodes == (f"{node}#1",)
+    monitor.take(getattr(story, what), node, 1, 5.0, 5.0)
+    assert not monitor.active
 
 
 def test_a_new_life_is_forgiven_and_judged_by_what_it_says():

@@ -8,9 +8,7 @@ import math
 import pytest
 
 from rampart.actors.detection.freshness import Freshness, FreshnessMonitor
-from rampart.actors.detection.module import EXCUSE_S
 from rampart.actors.ftm import messages as fm
-from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.testing import Ear, play, table
@@ -50,17 +48,6 @@ def test_freshness_timeline(events, expected):
     assert play(monitor, lambda e, t: monitor.heard(stamp(e, t), t), events) == expected
 
 
-@pytest.mark.parametrize(("events", "expected"), **table({
-    "it knows with the first sample": ("..ff", "??--"),
-    "it knows when none has come": ("......", "?????A"),
-    "an old sample tells it that the topic is stale": ("d", "A"),
-}))
-def test_a_respawned_monitor_claims_nothing_before_it_knows(events, expected):
-    monitor = FreshnessMonitor("pose", timeout_s=0.3, hold_s=0.2, start_s=0.0, grace_s=0.5,
-                               known=False)
-    assert play(monitor, lambda e, t: monitor.heard(stamp(e, t), t), events) == expected
-
-
 @in_system()
 async def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_second(system):
     ear = system.start("ear", Ear)
@@ -79,24 +66,6 @@ async def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_s
     assert ear.states == ["idle", "active", "idle"]
     assert dm2.state is fm.DetectionState.IDLE
     assert ear.heard[-1][1].reason == ""
-
-
-@in_system()
-async def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges(system):
-    ear = system.start("ear", Ear)
-    system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
-    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
-    await asyncio.sleep(0.1)
-    loop = asyncio.get_running_loop()
-    loop.jump(2.0)  # all are late, and so are the messages; the first of its mail may be old
-    system.say(topics.COMMAND, m.Twist(0.5, 0.0), stamp_s=system.clock.now() - 1.0)
-    await asyncio.sleep(EXCUSE_S / 2)
-    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
-    await asyncio.sleep(0.2)
-    assert ear.states == ["idle"]
-    loop.jump(2.0)  # the mail is read, but there was none
-    await asyncio.sleep(GRACE_S + 0.02)
-    assert ear.states == ["idle", "active"]
 
 
 @pytest.mark.parametrize(("parameter", "value", "expected"), [

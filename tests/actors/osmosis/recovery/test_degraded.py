@@ -105,21 +105,6 @@ async def test_the_farewells_of_an_emergency_stop_leave_the_brake_that_a_respawn
         await asyncio.sleep(0.02)
 
 
-@in_system()
-async def test_a_respawned_module_that_is_not_wanted_releases_what_its_earlier_life_held(system):
-    boss, base, supervisor = await braking(system)
-    supervisor.answer = "nothing"
-    boss.order("RM7", nodes=("safety_pilot#1",))
-    await system.settle()
-    await system.kill("RM7")
-    boss.release("RM7")
-    await asyncio.sleep(0.5)
-    assert base.engaged
-    system.start("RM7", RespawnBraked, nodes=["safety_pilot"])
-    await asyncio.sleep(0.5)
-    assert not base.engaged
-
-
 @pytest.mark.parametrize("obeys", [True, False])
 @in_system()
 async def test_the_pilot_is_bounded_until_released_and_one_that_keeps_no_bound_fails(system, obeys):
@@ -136,10 +121,3 @@ async def test_the_pilot_is_bounded_until_released_and_one_that_keeps_no_bound_f
         boss.release("RM8")
         await system.settle()
         assert pilot.bound_mps == 0.0
-
-
-@pytest.mark.parametrize("bad", [0, -1.0, "fast", True])
-@in_system()
-async def test_a_bound_that_is_none_is_refused_by_name(system, bad):
-    with pytest.raises(ValueError, match=r"parameters\.top_speed_mps = "):
-        system.start("RM8", ReducedSpeed, top_speed_mps=bad)

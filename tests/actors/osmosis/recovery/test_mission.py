@@ -9,13 +9,13 @@ import pytest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
-from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode
+from rampart.actors.osmosis.messages import MissionPhase, Mode
 from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.osmosis.recovery.return_home import ReturnHome
 from rampart.actors.runtime.actor import Actor, on
 from rampart.testing import run
 from tests.actors.osmosis.control.house import AIRPORT
-from tests.actors.osmosis.recovery.world import Boss, hang
+from tests.actors.osmosis.recovery.world import Boss
 from tests.osmosis_system import System
 
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
@@ -133,28 +133,6 @@ def test_with_nothing_to_bring_home_it_waits_for_a_mission_that_is_begun(begun):
         assert boss.phases[-1] == "degraded"
 
     come_home(scenario, mission=False)
-
-
-def test_a_robot_on_its_way_home_already_is_left_alone():
-    async def scenario(boss, planner, manager):
-        manager.order(m.MissionOrder("o1", MissionAction.HOME, "lunch", "operator"), None)
-        await asyncio.sleep(0.5)
-        boss.order("RM9")
-        await asyncio.sleep(0.5)
-        assert boss.phases[-1] == "degraded"
-        assert manager.state.homing == "operator: lunch"
-
-    come_home(scenario)
-
-
-def test_it_fails_at_its_deadline_without_a_mission_manager():
-    async def scenario(boss, planner, manager):
-        hang(manager)
-        boss.order("RM9")
-        await asyncio.sleep(2.3)
-        assert boss.phases[-1] == "failed"
-
-    come_home(scenario)
 
 
 @pytest.mark.parametrize("late_s", [1.0, 3.0])

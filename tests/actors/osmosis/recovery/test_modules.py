@@ -224,24 +224,6 @@ async def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard(system
     assert system.incarnations["a"] == 2
 
 
-@pytest.mark.parametrize(("delay_s", "phases"), [
-    (0.3, ["idle", "acting", "done"]), (0.05, ["idle", "acting", "done", "acting", "done"])])
-@in_system()
-async def test_a_second_node_that_fails_is_respawned_too_and_who_is_well_left_alone(
-        system, delay_s, phases):
-    boss, supervisor = await respawning(system)
-    supervisor.delay_s = delay_s
-    await system.kill("a")
-    boss.order("RM3", decision=1, nodes=("a",))
-    await asyncio.sleep(0.2)
-    await system.kill("b")
-    boss.order("RM3", decision=2, nodes=("a", "b"))
-    await asyncio.sleep(0.5)
-    assert boss.phases == phases
-    assert boss.reports[-1].message.reason == "a, b back"
-    assert (system.incarnations["a"], system.incarnations["b"]) == (2, 2)
-
-
 @pytest.mark.parametrize("answer", ["refused", "given up"])
 @in_system()
 async def test_what_the_supervisor_will_not_do_is_a_failure(system, answer):

@@ -33,9 +33,9 @@ async def ask(robot, order="1"):
 
 
 @asynccontextmanager
-async def inside(system="paper"):
+async def inside():
     """Drive the robot into the grass without a brake, and stop it there."""
-    async with driven(system, without=("RM1",)) as robot:
+    async with driven(without=("RM1",)) as robot:
         robot.hold(0.0, 0.5)
         out_rad = math.pi  # to the west there is grass beside the apron
         await robot.until(lambda: abs(math.remainder(
@@ -51,16 +51,19 @@ async def inside(system="paper"):
         yield robot
 
 
-@pytest.mark.parametrize("system", ["paper", "osmosis"])
-def test_the_operator_drives_the_robot_out_slowly_and_resets_the_emergency_stop(system):
+def test_the_operator_drives_the_robot_out_slowly_and_resets_the_emergency_stop():
     async def scenario():
-        async with inside(system) as robot:
+        async with inside() as robot:
             robot.hold(-1.0)
             assert await robot.fastest(1.0) < STANDING, "not without the operator's word"
             robot.let_go()
             answers = await ask(robot)
             assert answers[0].message.granted
             await asyncio.sleep(0.5)
+            before_m = depth_m(robot)
+            robot.hold(1.0)
+            assert await robot.fastest(1.5) < STANDING, "the wrong direction"
+            assert depth_m(robot) == pytest.approx(before_m, abs=0.01)
             robot.hold(-1.0)
             speeds = [await robot.fastest(1.0)]
             assert speeds[0] > 0.1
@@ -78,26 +81,7 @@ def test_the_operator_drives_the_robot_out_slowly_and_resets_the_emergency_stop(
     run(scenario)
 
 
-def test_the_wrong_direction_does_not_move_the_robot_and_turning_is_slow():
-    async def scenario():
-        async with inside() as robot:
-            await ask(robot)
-            await asyncio.sleep(0.5)
-            before_m = depth_m(robot)
-            robot.hold(1.0)
-            assert await robot.fastest(1.5) < STANDING
-            assert depth_m(robot) == pytest.approx(before_m, abs=0.01)
-            robot.hold(1.0, 1.0)
-            await asyncio.sleep(0.5)
-            assert abs(robot.truth.twist.linear_mps) < STANDING
-            assert 0.1 < abs(robot.truth.twist.angular_radps) < 0.6
-
-    run(scenario)
-
-
-@pytest.mark.parametrize("lost", [
-    "stick", "letting go", "safety_pilot", "ftm_manager", "RM1", "teleoperation", "localization",
-    "gps"])
+@pytest.mark.parametrize("lost", ["letting go", "safety_pilot", "ftm_manager", "RM1", "gps"])
 def test_whatever_is_lost_meanwhile_stops_the_robot(lost):
     async def scenario():
         async with inside() as robot:
@@ -105,9 +89,7 @@ def test_whatever_is_lost_meanwhile_stops_the_robot(lost):
             await asyncio.sleep(0.5)
             robot.hold(-1.0)
             assert await robot.fastest(1.0) > 0.1
-            if lost == "stick":
-                robot.lose_the_stick()
-            elif lost == "letting go":
+            if lost == "letting go":
                 robot.let_go()
             elif lost == "gps":
                 robot.system.inject(topics.GPS, "drop", 100.0)
@@ -120,7 +102,7 @@ def test_whatever_is_lost_meanwhile_stops_the_robot(lost):
             if lost in robot.system.layout.members:
                 robot.system.start_node(lost)
                 assert await robot.fastest(3.0) < STANDING, "nor when it is back"
-            robot.lose_the_stick()
+            robot.let_go()
             if lost != "RM1":
                 await robot.until(lambda: not answers[-1].message.granted)
             await robot.until(lambda: "RM1" in robot.manager.activated)

@@ -177,18 +177,6 @@ def test_a_standby_goes_back_where_the_active_one_does_and_stops_when_it_does():
     assert row.back_to is None
 
 
-def test_both_turn_round_the_same_way():
-    ways = set()
-    for last_radps in (-0.1, -0.01, 0.0, 0.02):
-        row = straight_row()
-        row._ramp.last = (0.8, last_radps)
-        row.adopt((15.0, 0.0), passing=False)
-        for _ in range(4):
-            motion = row.step(20.0, 0.0, 0.0, NO_POINTS, PERIOD_S)
-        ways.add(math.copysign(1, motion.angular_radps))
-    assert ways == {1.0}
-
-
 # ---- the yaw loop -------------------------------------------------------------------------------
 
 
@@ -256,5 +244,3 @@ def test_a_loop_that_only_listens_adds_what_the_other_does_until_that_is_silent(
     drive_on = [loop.pose(1.0 + i * PERIOD_S, i * 0.04, 0.0, 0.0) or loop.turn(0.8, 0.5, PERIOD_S)
                 for i in range(40)]
     assert drive_on[-1] > 0.5 + 0.3
-
-
