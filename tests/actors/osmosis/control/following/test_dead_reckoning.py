@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
+from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.testing import run
 from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
+from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
 from tests.actors.osmosis.control.world import World
 from tests.osmosis_system import System, shipped_system
 
@@ -96,6 +97,25 @@ def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves,
     assert found is not None
     assert found[:2] == pytest.approx(truth[:2], abs=1e-9)
     assert math.remainder(found[2] - truth[2], math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("from_s", [2.0, 12.0])
+def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(from_s):
+    it, worst_m, bridged = DeadReckoning(3.0), 0.0, 0
+    for now_s, item in disturbed([]):
+        if isinstance(item, Reading) and item.topic is topics.ODOMETRY:
+            pose = item.body.pose
+            it.odometry(now_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
+        elif isinstance(item, Reading) and item.topic is topics.ABSOLUTE_POSE and now_s <= from_s:
+            it.pose(now_s, (item.body.x_m, item.body.y_m, item.body.yaw_rad), now_s)
+        elif isinstance(item, Truth) and now_s > from_s + AFTER_S:
+            found = it.estimate(now_s)
+            if found is None:
+                break
+            bridged += 1
+            worst_m = max(worst_m, math.dist(found[:2], (item.x_m, item.y_m)))
+    assert bridged > 20
+    assert worst_m < 0.25
 
 
 # ---- in Osmosis Control --------------------------------------------------------------------------
