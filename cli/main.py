@@ -19,7 +19,7 @@ from rampart.cli.analyse import (
     check_verbs,
     cut_set_verbs,
     decide_verbs,
-    tree_verbs,
+    tree_verb,
     verify_verb,
 )
 from rampart.cli.look import doctor_verb, ros_verbs, serving_verbs, topic_verbs
@@ -39,7 +39,7 @@ from rampart.files import loading, streams, working_folder
 _MODULES = (
     node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
     record_verbs, incident_verbs, keys_verb, token_verbs, check_verbs, cut_set_verbs,
-    decide_verbs, tree_verbs, verify_verb, doctor_verb, service_verb)
+    decide_verbs, tree_verb, verify_verb, doctor_verb, service_verb)
 """Each adds its verbs."""
 
 _GROUPS = {

@@ -50,8 +50,8 @@ class RobotLines:
         """Return the same as data."""
         return {}
 
-    def rows(self, latest: Latest, width: int) -> list[Row]:
-        """Return the lines of `rampart top` for a screen of some width in cells."""
+    def rows(self, latest: Latest) -> list[Row]:
+        """Return the lines of `rampart top`."""
         return []
 
     def data(self, latest: Latest) -> dict[str, Any]:

@@ -218,9 +218,8 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Show the run.
 
     Show the robot, mechanisms, decisions, processes and topic rates of the run,
-    four times a second. Keys: q or Ctrl-C quits, c sorts by processor time, the
-    arrows scroll. Processor time is in percent of one core. Memory is resident
-    memory, most of which is shared.
+    four times a second. q or Ctrl-C quits. Processor time is in percent of one
+    core. Memory is resident memory, most of which is shared.
 
     Examples:
       rampart top
@@ -229,9 +228,9 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
       NO_COLOR=1 rampart top
       rampart top --json | python3 -m json.tool
     """
-    from rampart.cli.look import top_screen  # noqa: PLC0415 its import would slow other verbs
+    from rampart.cli.look import top  # noqa: PLC0415 its import would slow other verbs
 
-    return top_screen.top(options)
+    return top.top(options)
 
 
 def _lines(run: RunInfo) -> tuple[RobotLines, bool, dict[str, str]]:

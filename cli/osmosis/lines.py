@@ -10,8 +10,6 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli.robot_lines import SILENT, Latest, RobotLines, Row
 
-_BAR = 20
-
 
 class OsmosisLines(RobotLines):
     """Mission, robot, Safety Pilot, and safety by the ground truth."""
@@ -33,13 +31,13 @@ class OsmosisLines(RobotLines):
         """Return the same as data."""
         return {"mission": latest(topics.MISSION_STATUS), "pilot": latest(topics.PILOT_STATUS)}
 
-    def rows(self, latest: Latest, width: int) -> list[Row]:
+    def rows(self, latest: Latest) -> list[Row]:
         """Return the lines of `rampart top`."""
         pilot: m.PilotStatus | None = latest(topics.PILOT_STATUS)
         base: m.BaseStatus | None = latest(topics.BASE_STATUS)
         safety = _safety(latest(topics.TRUTH))
         return [
-            Row("mission", _mission(latest(topics.MISSION_STATUS), width), "",
+            Row("mission", mission_in_words(latest(topics.MISSION_STATUS)), "",
                 topics.MISSION_STATUS),
             Row("robot", _robot(latest), "", topics.POSE),
             Row("pilot", pilot_in_words(pilot, base),
@@ -111,15 +109,6 @@ def pilot_in_words(status: m.PilotStatus | None, base: m.BaseStatus | None = Non
     doing = "BRAKED" if braked else "STOPPED" if status.stopped else "driving"
     text = f"{status.mode.value}, {doing}"
     return f"{text}: {status.reason}" if status.reason else text
-
-
-def _mission(status: m.MissionStatus | None, width: int) -> str:
-    words = mission_in_words(status)
-    if status is None or not status.goals or width < 100:
-        return words
-    steps = len(status.goals)
-    done = round(_BAR * min(status.step, steps) / steps)
-    return f"[{'#' * done}{'.' * (_BAR - done)}] {words}"
 
 
 def _robot(latest: Latest) -> str:

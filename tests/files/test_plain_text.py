@@ -15,7 +15,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header
-from rampart.cli.look import top_view
+from rampart.cli.look import top
 from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.output import print_json, print_table, say, say_text, warn
@@ -89,8 +89,7 @@ def test_a_console_shows_control_characters_without_obeying_them(topic):
     console.close()
     assert harmless(stream.getvalue())
     screen = RichConsole(file=io.StringIO(), width=100, no_color=True)
-    for line in top_view.lines(top_view.Frame("x", 7450, 1.0, 0.0, picture), 100, 40):
-        screen.print(line)
+    screen.print(top.screen(top.Frame("x", 7450, 1.0, 0.0, picture), 100))
     assert harmless(screen.file.getvalue())
 
 

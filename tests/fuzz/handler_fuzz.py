@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
+from rich.console import Console as RichConsole
 
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
@@ -33,7 +34,7 @@ from rampart.actors.supervision.processes import ProcessHandle
 from rampart.actors.system.layout import Layout, load_run
 from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
-from rampart.cli.look import top_view
+from rampart.cli.look import top
 from rampart.cli.look.metrics_families import Exposition, families
 from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.osmosis.lines import OsmosisLines
@@ -260,10 +261,10 @@ def fuzz_tools(draw: Draw) -> None:
             for _, view in views.of(topic, topic.at("DM1") if topic.is_family else topic.at(),
                                     header, body, 0):
                 msgspec.json.encode(view)
-            frame = top_view.Frame("fuzz", 7450, 1.0, now_s, picture)
-            for width, height in ((80, 24), (1, 1), (200, 60), (0, 0)):
-                top_view.lines(frame, width, height)
-            msgspec.json.encode(top_view.picture_json(frame))
+            frame = top.Frame("fuzz", 7450, 1.0, now_s, picture)
+            for width in (1, 80, 200):
+                RichConsole(file=io.StringIO(), width=width).print(top.screen(frame, width))
+            msgspec.json.encode(top.picture_json(frame))
             list(families(Exposition(_Run(), now_s, picture)))  # type: ignore[arg-type]
 
 

@@ -27,7 +27,7 @@ from rampart.cli.look.live_foxglove import _watch
 from rampart.cli.look.metrics_families import Exposition, families
 from rampart.cli.run_picture import RunPicture
 from tests import ROOT
-from tests.cli.look.test_top_view import busy
+from tests.cli.look.test_top import busy
 
 RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ and\nmore')
 
