@@ -1,16 +1,10 @@
 """`rampart ros2`: compare a system with a graph of ROS 2.
 
-Check a system against ROS 2. `rampart topic list`, `echo` and `hz` show topics of
-ROS 2 with --ros. Over rmw_zenoh these verbs need no installation of ROS, over
-DDS they do. They need the extra: pip install 'rampart-robot[ros2]'.
-The variables ROS_DOMAIN_ID and ROS_DISTRO select domain and distribution, as in
-ROS 2.
+Check a system against ROS 2. Over rmw_zenoh this needs no installation of ROS, over
+DDS it does. It needs the extra: pip install 'rampart-robot[ros2]'.
 
 Examples:
   rampart ros2 check --system warehouse.toml
-  rampart topic list --ros
-  rampart topic list --ros rclpy
-  rampart topic echo /odom --ros tcp/192.168.0.12:7447 -n 1
 """
 
 from __future__ import annotations
@@ -45,16 +39,7 @@ def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
 
     exit code: 0 no problem, 1 a problem, 2 bad usage
     """
-    return look().check(options)  # type: ignore[no-any-return]
-
-
-def look() -> Any:
-    """Return the module that looks at ROS 2.
-
-    Raises:
-        UsageError: the extra is not installed.
-    """
     extra("ros2", "rosbags", "xxhash")
-    from rampart.cli.look import ros_topics  # noqa: PLC0415 of the extra
+    from rampart.cli.look import ros_check  # noqa: PLC0415 of the extra
 
-    return ros_topics
+    return ros_check.check(options)

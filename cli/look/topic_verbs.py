@@ -14,20 +14,22 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import math
+import statistics
 from collections import deque
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
+
+import msgspec
 
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.following import LOOK_S, is_over
-from rampart.cli.look import ros_verbs
 from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.look.topic_catalogue import (
     UnreadableError,
@@ -36,7 +38,6 @@ from rampart.cli.look.topic_catalogue import (
     resolve,
     topics_for,
 )
-from rampart.cli.look.topic_lines import Echo, in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, positive, print_json, print_rows, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
@@ -51,25 +52,22 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     topic = add_family(verbs, "topic", "list, print and measure topics", __doc__)
     key = option("key", metavar="KEY", completer=completion.topics, help="key of a topic")
-    ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
-                 help=f"use topics of ROS 2, by the router at ENDPOINT (default: {ROUTER}), or, "
-                      "with rclpy in its place, by the sourced ROS 2")
     add_verb(topic, "list", "list all topics; needs no run", topic_list,
              systems.choice(default="that of the run, else osmosis"),
-             either(JSON, flag("--markdown", "print the reference page of topics")), ros)
+             either(JSON, flag("--markdown", "print the reference page of topics")))
     add_verb(topic, "info", "show the contract of one topic; needs no run", topic_info, key,
              word("--system", "FILE", "system file (default: that of the run, else osmosis)"),
              JSON)
     add_verb(topic, "echo", "print messages as they arrive", topic_echo, PORT, key,
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
-             flag("--json", "print one JSON object per line"), ros)
+             flag("--json", "print one JSON object per line"))
     add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
              number("--duration", "S", "end after S real seconds (default with --json: 3)"),
-             flag("--json", "print JSON at the end"), ros)
+             flag("--json", "print JSON at the end"))
 
 
-def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
+def topic_list(options: argparse.Namespace) -> int:
     """Print all topics.
 
     List all topics with message type, quality of service, nominal rate and frame.
@@ -77,10 +75,7 @@ def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     Examples:
       rampart topic list
       rampart topic list osmosis --markdown > topics.md
-      rampart topic list --ros
     """
-    if options.ros:
-        return ros_verbs.look().list_topics(options)  # type: ignore[no-any-return]
     spec = systems.at_hand(options.system)
     if options.markdown:
         say_text(catalogue.markdown(spec).rstrip("\n"))
@@ -136,31 +131,35 @@ async def topic_echo(options: argparse.Namespace) -> int:
     """
     positive("--count", options.count)
     positive("--duration", options.duration)
-    if options.ros:
-        return await ros_verbs.look().echo(options)  # type: ignore[no-any-return]
     topic, key = _topic_of(options)
-    echo = Echo(options)
+    done, seen = asyncio.Event(), itertools.count(1)
+
+    def show(data: dict[str, Any], line: str) -> None:
+        number = next(seen)
+        if options.count and number >= options.count:
+            done.set()
+        if not options.count or number <= options.count:
+            print_json(data, indent=False) if options.json else say(line)
 
     def heard(short: str, header: Header, body: Any) -> None:
-        echo.show(
-            {"key": short, "stamp": header.stamp, "source": header.source,
-             "incarnation": header.incarnation, "sequence": header.sequence, "message": body},
-            f"{header.stamp:.3f} {header.source}#{header.incarnation} {short} {in_line(body)}")
+        show({"key": short, "stamp": header.stamp, "source": header.source,
+              "incarnation": header.incarnation, "sequence": header.sequence, "message": body},
+             f"{header.stamp:.3f} {header.source}#{header.incarnation} {short} {in_line(body)}")
 
     def garbage(short: str, payload: bytes, reason: str) -> None:
-        echo.show(
-            {"key": short, "garbage": payload[:256].hex(), "bytes": len(payload), "reason": reason},
-            f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
-            f"{payload[:_SHOWN_BYTES]!r}")
+        show({"key": short, "garbage": payload[:256].hex(), "bytes": len(payload),
+              "reason": reason},
+             f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
+             f"{payload[:_SHOWN_BYTES]!r}")
 
     async with connect(options.port) as session:
         check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
         session.listen(topic, heard, key, garbage)
         async for left in _while_it_runs(session, options.duration):
-            if echo.done.is_set():
+            if done.is_set():
                 break
-            await pause(echo.done, min(LOOK_S, left))
-    if not echo.seen:
+            await pause(done, min(LOOK_S, left))
+    if next(seen) == 1:
         raise _nothing_came(options.key, options.duration)
     return 0
 
@@ -177,8 +176,6 @@ async def topic_hz(options: argparse.Namespace) -> int:
       rampart topic hz 'heartbeat/*' --duration 3 --json
     """
     positive("--duration", options.duration)
-    if options.ros:
-        return await ros_verbs.look().measure(options)  # type: ignore[no-any-return]
     topic, key = _topic_of(options)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration or (3.0 if options.json else None)
@@ -236,3 +233,41 @@ def _describe(use: catalogue.TopicUse) -> dict[str, Any]:
     return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
             "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": catalogue.MAILBOX[topic.qos],
             "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}
+
+
+def rate_of(times_s: list[float]) -> dict[str, Any]:
+    """Return rate and spread of arrival times, as `ros2 topic hz` does."""
+    gaps = [b - a for a, b in itertools.pairwise(times_s)]
+    if not gaps:
+        return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
+                "window": len(times_s)}
+    mean = statistics.fmean(gaps)
+    return {
+        "rate_hz": 1 / mean if mean > 0 else None, "min_s": min(gaps), "max_s": max(gaps),
+        "std_dev_s": statistics.pstdev(gaps), "window": len(times_s),
+    }
+
+
+def in_line(body: Any) -> str:
+    """Return a message as one line of JSON, with the length of bytes instead of the bytes."""
+    plain = msgspec.to_builtins(body, builtin_types=(bytes,))
+
+    def shorten(value: Any) -> Any:
+        if isinstance(value, bytes):
+            return f"<{len(value)} bytes>"
+        if isinstance(value, dict):
+            return {k: shorten(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [shorten(v) for v in value]
+        return value
+
+    return msgspec.json.encode(shorten(plain)).decode()
+
+
+def print_rate(key: str, rate: dict[str, Any]) -> None:
+    """Print a result of `rate_of`."""
+    if rate["rate_hz"] is None:
+        say(f"{key}: one message so far")
+        return
+    say(f"{key}: average rate: {rate['rate_hz']:.3f} min: {rate['min_s']:.3f}s "
+        f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")

@@ -18,7 +18,6 @@ from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import UNKNOWN_GID, Qos
 from rampart.actors.supervision.kill_node import signal_node
-from rampart.cli.main import main
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_against_ros import ROS
@@ -431,10 +430,11 @@ async def test_a_setup_that_is_not_there_is_refused(domain, monkeypatch):
 # -- verbs -----------------------------------------------------------------------------------------
 
 
-def test_the_check_finds_the_nodes_on_dds(capsys, system):
+def test_the_check_finds_the_nodes_on_dds_in_the_active_environment(capsys, monkeypatch, system):
+    activate(monkeypatch, SETUP.parent.parent)
     with Peer(PEER, "base") as peer:
         peer.wait_for("up")
-        code, found = checked(capsys, system(MANY))
+        code, found = checked(capsys, system(MANY, setup=""))
     assert found["relay of gateway"] == (True, "rclpy")
     assert found["subscribe /odom"] == (True, "/base, nav_msgs/msg/Odometry")
     assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
@@ -469,18 +469,3 @@ fields = { heartbeat_period = "linear_mps" }
 """))
     assert code == 1
     assert "this ROS 2 has no bond/msg/Status" in found["types"][1]
-
-
-def test_topics_on_dds_are_listed_shown_and_measured(capsys, monkeypatch):
-    activate(monkeypatch, SETUP.parent.parent)
-    with Peer(PEER, "base") as peer:
-        peer.wait_for("up")
-        assert main(["topic", "list", "--ros", "rclpy", "--json"]) == 0
-        listed = json.loads(capsys.readouterr().out)
-        assert {"topic": "/odom", "types": ["nav_msgs/msg/Odometry"], "publishers": ["/base"],
-                "subscribers": []} in listed
-        assert main(["topic", "echo", "/base/name", "--ros", "rclpy", "-n", "1", "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["message"] == {"data": "osmosis"}
-        assert main(["topic", "hz", "/odom", "--ros", "rclpy", "--json"]) == 0
-        measured, = json.loads(capsys.readouterr().out)
-        assert 5 < measured["rate_hz"] < 25

@@ -1,4 +1,4 @@
-"""`rampart ros2 check` and `rampart topic … --ros` beside a robot that is there, and none."""
+"""`rampart ros2 check` beside a robot that is there, and none."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import ZenohSide
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Qos
-from rampart.cli.look import ros_topics
+from rampart.cli.look import ros_check
 from rampart.cli.main import main
 from rampart.testing import free_port
 from tests.actors.ros2.test_gateway import SYSTEM
@@ -79,8 +79,8 @@ class Robot:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
-    monkeypatch.setattr(ros_topics, "_LINK_S", 1.0)
-    monkeypatch.setattr(ros_topics, "_GRAPH_S", 0.3)
+    monkeypatch.setattr(ros_check, "_LINK_S", 1.0)
+    monkeypatch.setattr(ros_check, "_GRAPH_S", 0.3)
 
 
 @pytest.fixture
@@ -303,29 +303,3 @@ def test_a_type_that_is_not_known_is_refused(capsys, system):
     with Robot(port):
         assert main(["ros2", "check", "--system", path]) == 2
     assert "type 'base_msgs/srv/Go' is not known to jazzy" in capsys.readouterr().err
-
-
-def test_topics_are_listed_shown_and_measured(capsys):
-    port = free_port()
-    with Robot(port) as robot:
-        assert main(["topic", "list", "--ros", robot.where, "--json"]) == 0
-        listed = json.loads(capsys.readouterr().out)
-        assert {"topic": "/odom", "types": ["nav_msgs/msg/Odometry"], "publishers": ["/base"],
-                "subscribers": []} in listed
-        assert main(["topic", "echo", "/odom", "--ros", robot.where, "-n", "2", "--json"]) == 0
-        first, second = map(json.loads, capsys.readouterr().out.splitlines())
-        assert second["sequence"] == first["sequence"] + 1
-        assert first["message"]["pose"]["pose"]["orientation"]["w"] == 1.0
-        assert main(["topic", "hz", "/odom", "--ros", robot.where, "--json"]) == 0
-        measured, = json.loads(capsys.readouterr().out)
-        assert 5 < measured["rate_hz"] < 25
-        assert main(["topic", "echo", "/imu", "--ros", robot.where, "-n", "1"]) == 1
-        assert "no node publishes /imu; topics: /cmd_vel, /odom" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("name", "value", "why"), [
-    ("ROS_DOMAIN_ID", "x", "ROS_DOMAIN_ID=x: expected a number"),
-    ("ROS_DISTRO", "melodic", "ROS_DISTRO=melodic: unknown; known: humble")])
-def test_an_environment_that_makes_no_sense_is_refused(refused, monkeypatch, name, value, why):
-    monkeypatch.setenv(name, value)
-    assert why in refused("topic", "echo", "/odom", "--ros", "tcp/127.0.0.1:1")

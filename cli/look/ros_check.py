@@ -1,20 +1,18 @@
-"""`rampart topic … --ros` and `rampart ros2 check`: the graph of ROS 2.
+"""`rampart ros2 check`: a system beside the graph of ROS 2.
 
-Over Zenoh they join the graph as a session without a node, which is invisible there; by a relay, as
-a hidden node. They publish nothing.
+Over Zenoh it joins the graph as a session without a node, which is invisible there; by a relay, as
+a hidden node. It publishes nothing.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import math
-import os
 import socket
 import ssl
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
@@ -25,29 +23,20 @@ from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_nodes import RosNodes
 from rampart.actors.ros2.side import Tls, ZenohSide
-from rampart.actors.ros2.translation.fields import plain
 from rampart.actors.ros2.translation.tables import GATEWAY, Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import (
     ADMIN,
-    UNKNOWN_HASH,
-    Attachment,
     Endpoint,
     EndpointKind,
     Qos,
     data_key,
     dds_name,
-    ros_name,
 )
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
-from rampart.cli.look.topic_lines import Echo, in_line, print_rate, rate_of
-from rampart.cli.output import NoEffectError, UsageError, print_json, print_rows, warn
-from rampart.cli.session import pause
+from rampart.cli.output import NoEffectError, UsageError, print_rows
 from rampart.manager.spec.schema import SystemSpec
-
-DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"
-"""Variables of ROS 2."""
 
 RELAY = "rclpy"
 """In place of a router's endpoint: the middleware of the environment."""
@@ -60,9 +49,6 @@ _DISCOVERY_S = 3.0
 
 _NODE = "_rampart"
 """Node of a relay that looks on; `ros2 node list` leaves out names with `_` before them."""
-
-_TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
-
 
 _WHY: dict[type[OSError], str] = {
     ConnectionRefusedError: "connection refused; `ros2 run rmw_zenoh_cpp rmw_zenohd` starts one",
@@ -166,112 +152,6 @@ def _refusal_of_tls(plain: socket.socket, host: str, tls: Tls | None) -> str:
         if tls is not None and isinstance(error, ssl.SSLError) and error.reason:
             return f"it refuses TLS: {error.reason.lower().replace('_', ' ')}"
     return f"a program listens there, but not a router of Zenoh with{'' if tls else 'out'} TLS"
-
-
-def domain_of_environment() -> int:
-    """Return the domain of the environment, 0 by default.
-
-    Raises:
-        UsageError: it is not a domain.
-    """
-    domain = os.environ.get(DOMAIN, "0")
-    if not (domain.isascii() and domain.isdecimal() and len(domain) < 4):
-        raise UsageError(f"{DOMAIN}={domain}: expected a number from 0 to 232")
-    return int(domain)
-
-
-def distribution() -> str:
-    """Return the distribution of the environment, by default Jazzy.
-
-    Raises:
-        UsageError: the distribution is unknown.
-    """
-    name = os.environ.get(DISTRIBUTION, "jazzy")
-    if name not in DISTRIBUTIONS:
-        raise UsageError(f"{DISTRIBUTION}={name}: unknown; known: {', '.join(DISTRIBUTIONS)}")
-    return name
-
-
-async def list_topics(options: argparse.Namespace) -> int:
-    """Print the topics of ROS 2, as `rampart topic list` does."""
-    async with onlooker((options.ros,), domain_of_environment(), distribution()) as there:
-        found = [_described(topic, ends) for topic, ends in there.graph.topics().items()]
-    print_rows(("topic", "type", "publishers", "subscribers"), [
-        (row["topic"], ", ".join(row["types"]), ", ".join(row["publishers"]) or "-",
-         ", ".join(row["subscribers"]) or "-") for row in found], found, as_json=options.json)
-    return 0
-
-
-def _described(topic: str, ends: list[Endpoint]) -> dict[str, Any]:
-    return {"topic": topic, "types": sorted({ros_name(one.type) for one in ends}),
-            **{f"{word}s": sorted({one.full_name for one in ends if one.kind is kind})
-               for kind, word in zip(_TOPICS, ("publisher", "subscriber"), strict=True)}}
-
-
-async def echo(options: argparse.Namespace) -> int:
-    """Print messages of ROS 2, as `rampart topic echo` does."""
-    echo = Echo(options)
-
-    def heard(message: Any, attachment: Attachment) -> None:
-        echo.show({"topic": options.key, "sent_ns": attachment.stamp_ns,
-                   "sequence": attachment.sequence, "message": plain(message)},
-                  f"{attachment.stamp_ns / 1e9:.3f} {options.key} {in_line(plain(message))}")
-
-    await _receive(options, heard, echo.done, options.duration)
-    if not echo.seen:
-        raise NoEffectError(f"no message on {options.key}")
-    return 0
-
-
-async def measure(options: argparse.Namespace) -> int:
-    """Measure rates of ROS 2 in real time, as `rampart topic hz` does."""
-    times: list[float] = []
-
-    def show() -> None:
-        if times and not options.json:
-            print_rate(options.key, rate_of(times[-500:]))
-
-    await _receive(options, lambda *_: times.append(time.monotonic()), asyncio.Event(),
-                   options.duration or (3.0 if options.json else None), show)
-    if options.json:
-        print_json([{"topic": options.key, **rate_of(times[-500:])}])
-    if not times:
-        raise NoEffectError(f"no message on {options.key}")
-    return 0
-
-
-async def _receive(options: argparse.Namespace, heard: Callable[[Any, Attachment], None],
-                   done: asyncio.Event, duration_s: float | None,
-                   show: Callable[[], None] = lambda: None) -> None:
-    """Receive a topic until `done` or the end of the duration, and call `show` each second."""
-    domain, types = domain_of_environment(), Types(distribution())
-    async with onlooker((options.ros,), domain, types.distribution) as there:
-        ends = there.graph.on(options.key, EndpointKind.PUBLISHER)
-        if not ends:
-            known = ", ".join(there.graph.topics()) or "none"
-            raise NoEffectError(f"no node publishes {options.key}; topics: {known}")
-        name = ros_name(ends[0].type)
-        decode = types.decoder(name)
-        if ends[0].hash not in {types.hash(name), UNKNOWN_HASH}:
-            warn(f"{ends[0].full_name} has another definition of {name} than "
-                 f"{types.distribution}; set {DISTRIBUTION} to its distribution")
-
-        def arrived(payload: bytes, attached: bytes | None) -> None:
-            try:
-                heard(decode(payload), Attachment.unpack(attached))
-            except ValueError as error:
-                warn(f"{options.key}: {error}")
-
-        offered = ends[0].qos
-        there.side.subscribe(
-            ends[0].key, Qos(offered.reliable, offered.transient_local, depth=1), arrived)
-        until_s = time.monotonic() + (duration_s or math.inf)
-        while not done.is_set() and (left_s := until_s - time.monotonic()) > 0:
-            await pause(done, min(1.0, left_s))
-            show()
-
-
-# -- check ----------------------------------------------------------------------------------------
 
 
 class Finding(msgspec.Struct, frozen=True):
