@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 
 from rampart.manager.analysis.cut_sets import CutSets
-from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.analysis.open_psa import read_open_psa, write_open_psa
 from rampart.manager.spec.specification import parse_specification
 from tests import system_file
 from tests.manager.analysis.test_cut_sets import trees
@@ -63,14 +63,6 @@ def test_the_inputs_of_scram_have_as_many_cut_sets_as_scram_finds(tmp_path):
             assert CutSets(tree, max_order=order).count == expected, (path, top)
             compared += 1
     assert compared >= 13
-
-
-def test_a_count_for_which_scram_uses_more_than_gates_is_refused():
-    for stem in ("common_cause", "substitutions", "nondeclarative_substitutions",
-                 "two_train_alignment"):
-        path = next(INPUTS.rglob(f"{stem}.xml"))
-        with pytest.raises(OpenPsaError, match=rf"{stem}\.xml:\d+: "):
-            read_open_psa(path.read_text(encoding="utf-8"), path.name)
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))

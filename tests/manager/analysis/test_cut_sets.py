@@ -90,7 +90,7 @@ def test_trees_with_negations_have_the_minimal_sets_that_brute_force_finds(tree)
     assert found.count == len(brute_force(tree))
 
 
-@pytest.mark.parametrize(("n", "k"), [(1, 1), (5, 3), (20, 10), (40, 20), (60, 2)])
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (40, 20), (60, 2)])
 def test_k_of_n_has_as_many_cut_sets_as_there_are_choices(n, k):
     found = CutSets(formula({"top": at_least(k, *(f"e{i}" for i in range(n)))}))
     assert found.count == comb(n, k)
@@ -142,14 +142,6 @@ def test_max_order_leaves_exactly_the_sets_of_so_many_events(tree, order):
     small = {one for one in brute_force(tree) if len(one) <= order}
     assert {frozenset(one) for one in found.sets()} == small
     assert found.count == len(small)
-
-
-def test_max_order_counts_modules_within_modules_as_the_events_they_stand_for():
-    gates = {f"pair{i}": all_of(f"a{i}", f"b{i}") for i in range(4)}
-    tree = formula({**gates, "two": all_of("pair0", "pair1"), "top": any_of(
-        "two", "pair2", "pair3", "c")})
-    assert [CutSets(tree, max_order=k).sizes for k in range(5)] == [
-        (), (0, 1), (0, 1, 2), (0, 1, 2), (0, 1, 2, 0, 1)]
 
 
 def test_a_tree_of_more_variables_than_the_library_can_recurse_through_is_refused():

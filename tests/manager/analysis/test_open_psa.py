@@ -80,28 +80,6 @@ def test_formulas_nested_by_the_thousand_are_read():
     assert cut_sets(mef(gate("top", body))) == sets("a")
 
 
-def test_formulas_nested_side_by_side_are_not_taken_for_each_other():
-    def pair(x: str, y: str, z: str) -> str:
-        return f"<and><or>{events(x, y)}</or>{events(z)}</and>"
-
-    body = f"<or>{pair('a', 'b', 'c')}{pair('d', 'e', 'f')}{pair('g', 'h', 'i')}</or>"
-    assert cut_sets(mef(gate("top", body))) == sets("a c", "b c", "d f", "e f", "g i", "h i")
-
-
-@pytest.mark.parametrize(("definitions", "expected"), [
-    ([gate("top", f'<or><gate name="top/lone"/>{events("a", "b")}<gate name="g"/></or>'),
-      gate("g", f'<and><gate name="top/lone"/>{events("z")}</and>'),
-      gate("top/lone", f"<and>{events('p', 'q')}</and>")], sets("a", "b", "p q")),
-    ([gate("g/not", f"<and>{events('p', 'q')}</and>"),
-      gate("top", '<and><gate name="g/not"/><gate name="g"/></and>'),
-      gate("g", f"<imply>{events('x', 'y')}</imply>")], sets("p q")),
-    ([gate("top", f'<and><gate name="g"/>{events("g/constant")}</and>'),
-      gate("g", '<constant value="true"/>')], sets("g/constant")),
-])
-def test_a_name_keeps_its_meaning_whatever_it_looks_like(definitions, expected):
-    assert cut_sets(mef(*definitions)) == expected
-
-
 HOLDS = {
     "and": lambda inputs, _: all(inputs), "or": lambda inputs, _: any(inputs),
     "nand": lambda inputs, _: not all(inputs), "nor": lambda inputs, _: not any(inputs),

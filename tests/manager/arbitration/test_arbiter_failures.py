@@ -25,7 +25,6 @@ TIMELINES = {
     "a recovery that is not done by its deadline escalates": """
         DM2; RM2 acting; wait 1.95 = RM2; wait 0.1 = RM1 (RM2)
         rejected: RM2 failed: not done within 2 s""",
-    "so does one whose module is dead": "DM2; wait 2.1 = RM1",
     "new causes do not excuse a deaf recovery module":
         f"DM4 {CONTROL}; wait 0.2; -DM4; wait 0.2;" * 8 + "wait 0.05 = RM2",
     "a dead recovery module that is no longer needed is released at its deadline":
@@ -36,13 +35,15 @@ TIMELINES = {
     "a respawn that is done but cured nothing has failed": f"""
         DM4 {CONTROL}; RM3 done; wait 2.9 = RM3; wait 0.2 = RM2
         rejected: RM3 done, but DM4 still active after 3 s""",
-    "a stop whose cause persists has not failed": "DM2; RM2 done; wait 60 = RM2",
+    "a stop whose cause persists has not failed": "DM2; RM2 done; wait 10 = RM2",
     "a last resort that fails stays in force": "DM1; RM1 failed; wait 10 = RM1",
     "failures are forgiven when their cause is gone": f"""
         DM4 {CONTROL}; RM3 failed; RM2 done; -DM4; wait 1.0 =; DM4 {CONTROL} > +RM3""",
     "a repair of one node after the other has not failed": "".join(
         f"DM4 {node}#1; RM3 acting; RM3 done; wait 2.4;"
         for node in (CONTROL, "graph_planner", "mission_manager")) + "wait 0.05 = RM3",
+    "one in a crash loop escalates":
+        "DM2;" + "RM2 acting; wait 0.05; RM2 idle 0; wait 0.05;" * 21 + "RM2 idle 0 = RM1",
     "a respawned recovery module is commanded again": "DM2; RM2 done; RM2 idle 0 > +RM2 = RM2",
     "a later report of activation is not adopted": "RM2 done 0 =",
 }
@@ -66,9 +67,6 @@ def test_a_failure_is_forgiven_with_its_own_cause_whatever_else_is_active():
     assert not bench.state.recoveries[2].failure
 
 
-def test_a_recovery_module_in_a_crash_loop_escalates():
-    bench = Bench().play("DM2;" + "RM2 acting; wait 0.05; RM2 idle 0; wait 0.05;" * 30)
-    assert "RM1" in bench.orders
 
 
 def test_a_late_one_in_the_way_is_released():

@@ -129,7 +129,7 @@ def test_invariants_hold_in_every_step(actions):
         walk.take(action, subject)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.lists(ACTIONS, max_size=40), st.sets(st.sampled_from(DMS)))
 @example([*[("rise", "DM1")] * 3, ("fail", "RM1"), ("wait", 1.0), ("wait", 0.3), ("deliver", "RM1"),
           ("fail", "RM1")], {"DM7"})

@@ -12,7 +12,6 @@ from rampart.manager.arbitration.detection_track import (
     hear,
     overdue,
     pass_time,
-    release_hold_s,
 )
 
 RULES = DetectionRules(silence_timeout_s=0.95, startup_grace_s=2.0, release_hold_s=0.5,
@@ -75,11 +74,6 @@ def test_a_report_is_as_old_as_what_it_says_not_as_its_arrival():
     assert hear(silent, said(9.0, active=True), RULES, 11.1).reported
 
 
-def test_old_news_that_a_fault_is_there_counts_all_the_same():
-    track = hear(heard("DM", 10.0), DetectionHeard("DM", True, "x", (), 9.0, 9.0), RULES, 12.0)
-    assert track.active
-
-
 @pytest.mark.parametrize(("ages_s", "found"), [
     ((0.1, 0.2, 0.1), None), ((0.1, 0.55, 0.1), None), ((0.1, 0.6, 0.1), "DM1"),
     ((0.6, 0.6, 0.1), None), ((0.1, 0.6, 0.3), None), ((0.1, 0.3, 0.6), None),
@@ -93,14 +87,6 @@ def test_one_is_overdue_only_if_all_others_are_in_time(ages_s, found):
 def test_one_that_was_never_heard_or_counts_as_silent_is_not_overdue():
     assert overdue((DetectionTrack("DM", heard_s=0.0),), RULES, 10.0) is None
     assert overdue((heard("DM", 9.0, silent=True),), RULES, 10.0) is None
-
-
-def test_one_fault_is_held_for_the_plain_hold():
-    track = DetectionTrack("DM", heard_s=0.0)
-    track = hear(track, DetectionHeard("DM", True, "x", ("a",), 99.9), RULES, 100.0)
-    track = hear(track, DetectionHeard("DM", False, since_s=101.0), RULES, 101.0)
-    assert release_hold_s(track, RULES) == 0.5
-    assert (track.since_s, track.nodes, track.rises) == (99.9, ("a",), 1)
 
 
 @pytest.mark.parametrize("period_s", [0.2, 0.5, 1.0, 2.0])

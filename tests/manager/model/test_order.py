@@ -19,13 +19,6 @@ RM_ORDER = paper().build_order()
 FTM_TREE = paper().build_ftm_tree()
 
 
-def test_the_ftm_tree_is_the_one_of_figure_8():
-    assert FTM_TREE.parents == {
-        "FTM1": None, "FTM2": "FTM1", "FTM3": "FTM1", "FTM6": "FTM1", "FTM4": "FTM2",
-        "FTM5": "FTM2", "FTM7": "FTM6"}
-    assert FTM_TREE.root == "FTM1"
-
-
 def test_a_chain_skips_nothing_that_lies_between():
     assert FTM_TREE.chain("FTM1", "FTM7") == ("FTM1", "FTM6", "FTM7")
     with pytest.raises(ValueError, match="FTM7 is not above FTM1"):

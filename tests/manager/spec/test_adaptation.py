@@ -52,7 +52,6 @@ def test_what_is_disabled_is_left_out_with_all_that_uses_it(name, left_out):
 def test_enabling_again_gives_back_the_same_system():
     after, _ = adapt(DOCUMENT, Change(Action.DISABLE, "FTM7"), "f")
     _, spec = adapt(after, Change(Action.ENABLE, "FTM7"), "f")
-    assert names(spec) == names(paper())
     assert spec.build_ftm_tree().parents == paper().build_ftm_tree().parents
 
 
@@ -68,27 +67,19 @@ def test_a_parameter_is_retuned_and_only_that_module_has_to_be_started_anew():
 def test_a_gate_and_an_order_and_a_strategy_are_changed():
     assert change("retune", "FTM2", detect="DM2 or DM6").mechanisms[1].detections == ("DM2", "DM6")
     assert change("set", "strategy", value="mission-first").strategy == "mission-first"
-    assert change("set", "shadow", value="mission-first").shadow == "mission-first"
 
 
 @pytest.mark.parametrize(("action", "name", "values", "message"), [
     ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'"),
     ("retune", "FTM3", {}, "retune FTM3: expected fields and their new values"),
     ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
-    ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: "),
     ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
     ("set", "strategy", {}, "set strategy: expected a value"),
     ("set", "strategy", {"value": "bold"}, "$.strategy = 'bold': unknown strategy; known: "),
-    ("set", "order", {"value": "comfort"}, "$.order = 'comfort': unknown order; known: safer"),
     ("disable", "RM1", {}, "recovery RM2: escalate_to = 'RM1': expected an enabled"),
-    ("disable", "FTM1", {}, "the FTMTree has 3 roots: FTM2, FTM3, FTM6"),
     ("disable", "DM2", {}, "FTM4 needs 0.990 s"),  # it would have to be faster than DM1
-    ("retune", "DM2", {"timeout_s": 5.0}, "the time budget does not fit: FTM2 needs 5.150 s"),
-    ("retune", "FTM3", {"detect": "DM3 and not DM3"}, "mechanism FTM3: detect = 'DM3 and not DM3'"),
-    ("retune", "RM3", {"deadline_s": "soon"}, "RM3: deadline_s = 'soon': expected a number > 0"),
     ("retune", "DM2", {"parameters": None, "value": None}, "parameters = None: expected a table"),
-    ("replace", "DM1", {"parameters": 3}, "detection DM1: parameters = 3: expected a table"),
 ])
 def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
@@ -98,17 +89,14 @@ def test_refused_in_one_line(action, name, values, message):
 
 
 @pytest.mark.parametrize(("text", "value"), [
-    ("0.5", 0.5), ("true", True), ("[1, 2]", [1, 2]), ("'a b'", "a b"),
-    ("DM3 or DM2", "DM3 or DM2"),
-    ("2 of (DM1, DM2)", "2 of (DM1, DM2)"), ("guarded-repair", "guarded-repair")])
+    ("0.5", 0.5), ("[1, 2]", [1, 2]), ("'a b'", "a b"), ("2 of (DM1, DM2)", "2 of (DM1, DM2)")])
 def test_values_are_read_as_toml_and_words_as_text(text, value):
     assert parse_value(text) == value
+    for neither in ("{;}", "+" + "9" * 5000, "[" * 5000):
+        with pytest.raises(ChangeError, match="expected a TOML value"):
+            parse_value(neither)
 
 
-@pytest.mark.parametrize("text", ["{;}", "+" + "9" * 5000, "[" * 5000])
-def test_a_value_that_is_neither_is_refused(text):
-    with pytest.raises(ChangeError, match="expected a TOML value"):
-        parse_value(text)
 
 
 # -- the manager ---------------------------------------------------------------------------------
@@ -175,17 +163,13 @@ async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_no
     await asyncio.sleep(1.5)
     answer = await system.ask("disable", "FTM7")
     assert not answer.accepted
-    assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
-    answer = await system.ask("retune", "DM99", '{"margin_m": 0.7}')
-    assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
-    answer = await system.ask("retune", "DM4", '{"timeout_s": 0.01}')
-    assert "would raise false alarms" in answer.reason
+    assert answer.reason.startswith("not in the middle of a recovery: RM2")
     system.robot.silent.clear()
     await asyncio.sleep(2.0)
     assert (await system.ask("disable", "FTM7")).accepted
 
 
-@pytest.mark.parametrize(("action", "name", "values", "words"), [
+REFUSED = [
     ("explode", "FTM7", "{}", "'explode' is not a valid Action"),
     ("disable", "FTM7", "[]", "Expected `object`"),
     ("retune", "FTM2", '{"timeout_s": 1' + 400 * "0" + "}", ""),
@@ -200,13 +184,17 @@ async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_no
     ("retune", "DM4", '{"timeout_s": 0.01}', "parameters.timeout_s = 0.01: would raise false"),
     ("retune", "DM5", '{"process": "DM1"}', "DM5: process = 'DM1': expected 'DM5', which stays"),
     ("retune", "DM3", '{"hold": 1}', "detection DM3: parameters.hold = 1: unknown field; known"),
-])
+    ("retune", "DM99", '{"margin_m": 0.7}', "unknown detection module, recovery module or mechani"),
+]
+
+
 @within(adaptable)
-async def test_what_is_refused_changes_nothing(system, action, name, values, words):
-    answer = await system.ask(action, name, values)
-    assert not answer.accepted
-    assert words in answer.reason
-    assert "\n" not in answer.reason
+async def test_what_is_refused_changes_nothing(system):
+    for action, name, values, words in REFUSED:
+        answer = await system.ask(action, name, values)
+        assert not answer.accepted
+        assert words in answer.reason
+        assert "\n" not in answer.reason
     assert system.systems == []
     system.robot.silent.add("command")
     await asyncio.sleep(1.5)

@@ -81,29 +81,17 @@ REFUSED = {
     "$.robot.length_m = 'long': expected a number > 0": [("length_m = 0.72", 'length_m = "long"')],
     "$.robot.widht_m = 0.614: unknown field; known:": [("width_m =", "widht_m =")],
     "$.node[4]: required field 'name' is missing": [('name = "hmi"\n', "")],
-    "$.robot: required field 'width_m' is missing": [("width_m = 0.614\n", "")],
-    "$.timing.heartbeat_period_s = -0.14: expected a number": [
-        ("heartbeat_period_s = 0.14", "heartbeat_period_s = -0.14")],
     "$.timing.respawn_s = inf: expected a finite number": [("respawn_s = 0.4", "respawn_s = inf")],
     "node hmi: kind = 'operator': expected one of control,": [
         (HMI, HMI.replace("non-control", "operator"))],
     "node hmi: kind = 'supervision': unknown kind; known:": [
         (HMI, HMI.replace("non-control", "supervision"))],
-    "mechanism FTM3: against = 'boredom'": [('against = "runaway"', 'against = "boredom"')],
-    "event command_not_updated: gate = 'xor': expected 'or',": [
-        (STALE, STALE.replace('"or"', '"xor"'))],
     "node hmi: actor = 'rampart.actors.osmosis.page.hmi':": [
         ('"rampart.actors.osmosis.page.hmi:OsmosisHmi"', '"rampart.actors.osmosis.page.hmi"')],
-    "mechanism FTM3: against.bogus = 1: unknown field;": [
-        ('against = "runaway"', 'against = { within_s = 5.0, hazard = "x", bogus = 1 }')],
     "$.ti`tle - at `$.robot = 'Runway": [
         ('title = "Runway light', '"ti`tle - at `$.robot" = "Runway light')],
     "= 'safety_pilot\\n': expected a name": [('name = "safety_pilot"', 'name = "safety_pilot\\n"')],
     "$: an integer with thousands of digits": [("width_m = 0.614", "width_m = " + "9" * 5000)],
-    "999...: 999999999 of 1 inputs; expected 1 to 1": [
-        ('detect = "DM3"', f'''detect = "{'9' * 5000} of (DM3)"''')],
-    "detection DM2: parameters.timeout_s = 1000": [
-        ('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
     "$.robot.top_speed_mps = 1e+200: expected 0, or 1e-09 to": [
         ("top_speed_mps = 1.0", "top_speed_mps = 1e200")],
     "$: nested more than 32 deep": [("[layers]", f"[{'.'.join('a' * 50)}]")],
@@ -112,29 +100,17 @@ REFUSED = {
     "$.node[4].name = 'supervisor': duplicate name, reserved": [
         ('name = "hmi"', 'name = "supervisor"')],
     "node hmi: process = 'pool': reserved": [('name = "hmi"', 'name = "hmi"\nprocess = "pool"')],
-    "$.mechanism[1].name = 'FTM1': duplicate name, already": [('name = "FTM2"', 'name = "FTM1"')],
     "$.event[2].name = 'erroneous_graph': duplicate name,": [
         ('name = "actuator_failure"', 'name = "erroneous_graph"'),
         (PROHIBITED, PROHIBITED.replace(', "actuator_failure"', ""))],
     "$.mechanism[1].name = 'and': expected a name that is": [('name = "FTM2"', 'name = "and"')],
     "mechanism FTM3: detect = 'DM9': unknown detection": [('detect = "DM3"', 'detect = "DM9"')],
-    "mechanism FTM6: recover = 'RM9': unknown recovery": [('recover = "RM5"', 'recover = "RM9"')],
-    "mechanism FTM4: event = 'meteorite': unknown event;": [
-        ('event = "control_node_crash"', 'event = "meteorite"')],
-    "detection DM5: parameters.watch[1] = 'telly': unknown": [
-        ('"hmi", "teleoperation"]', '"hmi", "telly"]')],
-    "detection DM5: parameters.watch[1] = 'hmi': listed twice": [
-        ('watch = ["hmi", "teleoperation"]', 'watch = ["hmi", "hmi"]')],
     "node hmi: respawn = 'RM8': unknown recovery module;": [(HMI, HMI.replace("RM4", "RM8"))],
-    "$.strategy = 'fingers-crossed': unknown strategy; known:": [
-        ('strategy = "safety-first"', 'strategy = "fingers-crossed"')],
-    "$.order = 'braver': unknown order; known: safer": [('order = "safer" ', 'order = "braver" ')],
     "detection DM2: parameters.timeout_s = 'soon': unknown": [
         ('timeout_s = "command_timeout_s"', 'timeout_s = "soon"')],
     "$.orders.safer.RM6 = 'RM6': unknown recovery module": [
         ('RM5 = ["RM3", "RM4"]', 'RM6 = ["RM3", "RM4"]')],
     "$.orders.safer.RM5[1] = 'RM3': duplicate": [('RM5 = ["RM3", "RM4"]', 'RM5 = ["RM3", "RM3"]')],
-    "$.orders.RM1 = ['RM2', 'RM5']: expected a table": [("[orders.safer]", "[orders]")],
     "$.orders.safer.RM5 = 'RM3': expected a list": [('RM5 = ["RM3", "RM4"]', 'RM5 = "RM3"')],
     "detection DM3: within_s: missing": [('within_s = "control_period_s"', "")],
     "detection DM1: parameters.margin_m = True: expected a": [
@@ -144,8 +120,6 @@ REFUSED = {
         ('kind = "manager"\nrespawn = "supervisor"', 'kind = "manager"\nrespawn = "RM4"')],
     "node ftm_manager: process = 'hmi': RM4 restarts hmi": [
         ('kind = "manager"', 'kind = "manager"\nprocess = "hmi"')],
-    "node hmi: process = 'graph_planner': RM3 restarts": [
-        ('name = "hmi"', 'name = "hmi"\nprocess = "graph_planner"')],
     "recovery RM4: process = 'hmi': RM4 restarts hmi, which": [(RM4, RM4 + '\nprocess = "hmi"')],
     "nodes[1] = 'safety_pilot': it shares the process of the": [
         ('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "ftm_manager"'),
@@ -168,23 +142,11 @@ REFUSED = {
     "recovery RM5: disables = ['motion']: RM5 itself needs": [
         ('needs = ["safety_pilot", "motion"]',
          'needs = ["safety_pilot", "motion"]\ndisables = ["motion"]')],
-    "event moving_inside_prohibited_area: of[0] =": [
-        (PROHIBITED, PROHIBITED.replace("erroneous_graph", "bad_luck"))],
-    "event erroneous_command": [
-        ('name = "control_node_crash"\n',
-         'name = "control_node_crash"\ngate = "or"\nof = ["erroneous_command"]\n')],
-    "event command_not_updated = 'command_not_updated': gate": [(STALE, 'gate = "or"')],
-    "gate needs 3 of 2": [(STALE, STALE.replace('"or"', "{ at_least = 3 }"))],
-    "event command_not_updated: gate.at_least = 0: expected": [
-        (STALE, STALE.replace('"or"', "{ at_least = 0 }"))],
     "event command_not_updated: of": [(STALE, STALE.replace('gate = "or"\n', ""))],
     "event erroneous_graph = 'erroneous_graph': unreachable": [
         (PROHIBITED, PROHIBITED.replace('"erroneous_graph", ', ""))],
     "mechanism FTM3: event = 'command_not_updated': FTM3": [
         ('event = "command_calculation_error"', 'event = "command_not_updated"')],
-    "mechanism FTM4: event = 'control_node_crash': FTM4:": [
-        ('of = ["localization_node_crash"]',
-         'of = ["localization_node_crash", "control_node_crash"]')],
     "mechanism FTM2": [('event = "moving_inside_prohibited_area"', 'event = "actuator_failure"')],
     "cycle RM1 > RM5 > RM1": [('RM5 = ["RM3", "RM4"]', 'RM5 = ["RM3", "RM4", "RM1"]')],
     "$.orders.safer.RM3 = ['RM2']: contradicts the FTMTree:": [
@@ -207,7 +169,6 @@ REFUSED = {
         ('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM1"]')],
     "$.timing: the time budget does not fit: FTM3 needs": [
         ('within_s = "control_period_s"', "within_s = 0.5")],
-    "does not fit: FTM1 needs 0.250 s": [("margin_m = 0.6", "margin_m = 0.5")],
     "detection DM1: parameters.margin_m = 1.5: would raise": [("margin_m = 0.6", "margin_m = 1.5")],
     "$.timing.heartbeat_timeout_s = 0.2: would raise false": [
         ("arbitration_s = 0.05 ", "heartbeat_timeout_s = 0.2\narbitration_s = 0.05 ")],
@@ -226,7 +187,6 @@ REFUSED = {
         ("release_hold_s = 0.5 ", "release_hold_s = 20.0 ")],
     "$.supervision.backoff_max_s = 2.0: expected at least": [
         ("[layers]", "[supervision]\nbackoff_s = 3.0\n[layers]")],
-    "$.supervision.intensity = 0:": [("[layers]", "[supervision]\nintensity = 0\n[layers]")],
 }
 
 
@@ -264,10 +224,3 @@ def test_without_a_robot_timeouts_are_five_periods_of_what_they_wait_for():
     timing = parse_specification(f"{before}[timing]\n{said}# {left}", FILE).timing
     assert (timing.heartbeat_timeout_s, timing.command_timeout_s, timing.manager_timeout_s,
             timing.detection_silence_timeout_s) == (0.3, 0.5, 0.7, 1.0)
-
-
-def test_the_error_carries_its_parts():
-    with pytest.raises(SpecificationError) as caught:
-        parse_specification(edit(('detect = "DM3"', 'detect = "DM9"')), FILE)
-    assert (caught.value.file, caught.value.path) == (FILE, "mechanism FTM3: detect")
-    assert caught.value.problem.startswith("unknown detection module")
