@@ -27,7 +27,6 @@ def test_each_step_ends_with_the_action_that_px4_expects_or_the_reason_is_writte
 @pytest.mark.parametrize(("right", "wrong"), [
     ('R_DESCEND = ["R_LAND"]\nR_LAND = ["R_RETURN_KEPT"]',
      'R_RETURN_KEPT = ["R_DESCEND"]\nR_DESCEND = ["R_LAND"]'),
-    ("for_s = 5.0", "for_s = 0.0"),
     ('title = "Return, until the mode is changed"\n', 'title = "Return"\nenabled = false\n')])
 def test_a_wrong_specification_is_judged_so(tmp_path, right, wrong):
     assert right in TEXT

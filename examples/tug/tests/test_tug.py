@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from tug import floor, topics
+from tug import topics
 from tug.judge import Deliveries
 from tug.topics import Free, Goal, Motion, Place, Truth
 
@@ -27,15 +27,6 @@ SYSTEM = HERE / "tug.toml"
 def drive(*faults, ftm=True, seed=1):
     """Return what came of a run; the same one if asked again."""
     return virtual_run(SYSTEM, *faults, seed=seed, ftm=ftm)
-
-
-@pytest.mark.parametrize(("place", "gap_m"), **table({
-    "at the dock the wall is nearest": ((1.0, 0.9), 0.55),
-    "in the middle aisle a shelf": ((4.0, 3.0), 0.45),
-    "the corner of a shelf": ((1.7, 2.6), 0.15),
-}))
-def test_the_gap_to_what_is_nearest(place, gap_m):
-    assert floor.clearance_m(*place) == pytest.approx(gap_m)
 
 
 @pytest.mark.parametrize(("speed_mps", "free_m", "state"), **table({
@@ -121,11 +112,9 @@ def test_it_delivers_everything_and_comes_home():
 @pytest.mark.parametrize(("fault", "decided"), **table({
     "the controller dies": ("kill:controller@20", {"R_RESTART"}),
     "the mission dies with a trailer": ("kill:mission@20", {"R_RESTART"}),
-    "localization hangs": ("wedge:localization@20", {"R_RESTART"}),
     "the pilot dies": ("kill:pilot@20", {"R_RESTART_PILOT"}),
     "the pilot repeats itself": ("freeze:tug/drive@20+inf", {"R_RESTART_PILOT"}),
     "the pose is wrong for good": ("corrupt:localization/pose@20+inf", {"R_STOP", "R_RESTART"}),
-    "the mission repeats itself": ("freeze:mission/goal@20+inf", {"R_RESTART"}),
     "the pilot drives backwards": ("corrupt:tug/drive@20+inf", {"R_BRAKE", "R_RESTART_PILOT"}),
     "the pilot drives on and on": ("stuck:tug/drive@20+inf", {"R_BRAKE", "R_RESTART_PILOT"}),
 }))
@@ -136,9 +125,8 @@ def test_a_fault_is_recovered_from_and_the_work_is_done(fault, decided):
     assert decided <= {name for d in done.record.decisions for name in d.recoveries}
 
 
-@pytest.mark.parametrize("fault", ["corrupt:tug/free@20+inf", "freeze:tug/free@20+inf"])
-def test_what_cannot_be_mended_is_safe_all_the_same(fault):
-    assert drive(fault).judgement.safe
+def test_what_cannot_be_mended_is_safe_all_the_same():
+    assert drive("corrupt:tug/free@20+inf").judgement.safe
 
 
 def test_without_mechanisms_it_drives_into_a_wall():

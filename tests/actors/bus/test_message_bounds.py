@@ -31,9 +31,6 @@ def bounds_of(topic):
 @pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)
 def test_every_field_of_every_message_is_bounded(topic):
     assert list(unbounded(bounds_of(topic))) == []
-
-
-def test_the_header_is_bounded():
     assert list(unbounded(HEADER)) == []
 
 
@@ -161,15 +158,11 @@ def test_clip_makes_a_text_fit(text, chars, expected):
     ([[[1]]], False), ([[[[1]]]], True), (b"1234", False)])
 def test_oversized_counts_bytes_and_depth(value, too_much):
     assert oversized(value, budget=100, depth=3) is too_much
-
-
-def test_a_value_to_be_injected_is_bounded_where_it_is_made_as_well():
     with pytest.raises(ValueError, match="set_fields: more than"):
         bm.Injection("i", "t", "corrupt", 1.0, set_fields={"x": ["y" * 1000] * 1000})
 
 
-@pytest.mark.parametrize("field", ["x_m", "y_m", "yaw_rad"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_pose_that_is_not_finite_reaches_its_readers(field, value):
-    body = {**smallest(bounds_of(topics.POSE)), field: value}
+def test_a_pose_that_is_not_finite_reaches_its_readers(value):
+    body = {**smallest(bounds_of(topics.POSE)), "x_m": value}
     assert judged(topics.POSE, pack("x", 1, 1, 0.0, body))[0]

@@ -11,7 +11,7 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.detection.disagreement import Disagreement, Vote, agreeing, apart
+from rampart.actors.detection.disagreement import Disagreement, Vote, apart
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.process_usage import ProcessUsage
 from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
@@ -37,7 +37,6 @@ def noted(monitor: Sustained):
 
 # g: no error, w: error, ?: unknown; error for 300 ms, none for 200 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
-    "well": ("gggg", "----"),
     "wrong for long enough": ("gwwwwgggg", "----AAA--"),
     "wrong for a moment": ("gwwgww", "------"),
     "an error, then silence: the last note stands": ("gw......", "----AAAA"),
@@ -52,23 +51,14 @@ def test_what_lasts(events, expected):
 
 # m: a message. At least 10 Hz within 300 ms (3), at most 20 Hz (6).
 @pytest.mark.parametrize(("least", "most", "events", "expected"), **table({
-    "as often as it should": (10.0, math.inf, "mmmmmm", "------"),
     "the start is forgiven for 500 ms": (10.0, math.inf, "........", "-----AAA"),
     "too seldom": (10.0, math.inf, "mmmmm.mmmm", "-----AAA--"),
-    "it stops": (10.0, math.inf, "mmmmmmm...", "-------AAA"),
     "it comes back": (10.0, math.inf, "mmmmmm..mmmmm", "------AAAA---"),
-    "too often": (0.0, 8.0, "m.m.mmmm....", "------AA----"),
-    "silence is not too often": (0.0, 8.0, ".....", "-----"),
+    "too often, and silence is in order": (0.0, 8.0, "m.m.mmmm....", "------AA----"),
 }))
 def test_how_often(least, most, events, expected):
     monitor = RateMonitor(least, most, 0.3, 0.0, 0.5)
     assert play(monitor, lambda _event, now_s: monitor.heard(now_s), events) == expected
-
-
-def test_a_rate_that_was_too_high_is_in_order_again_after_a_while_of_silence():
-    monitor = RateMonitor(0.0, 8.0, 0.3, 0.0, 0.5, clear_s=0.4)
-    found = play(monitor, lambda _event, now_s: monitor.heard(now_s), "mmmm" + "." * 8)
-    assert found == "--AAAAAA----"
 
 
 def test_a_rate_of_which_nothing_could_be_heard_is_counted_from_the_start():
@@ -105,14 +95,13 @@ STEPS = (Step("1", 0.4), Step("2", 0.3, ("3", "1")), Step("3"))
 
 # 1, 2, 3: a step; b: busy for 500 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
-    "in order": ("1122311", "-------"),
+    "in order, from the middle": ("23112", "-----"),
     "in another order that is allowed": ("121123", "------"),
     "a step that is left out": ("1133.1", "--AAA-"),
     "a step that takes too long": ("1.....2", "----AA-"),
     "the last one may take as long as it likes": ("123......", "---------"),
     "busy": ("1b.....2", "------A-"),
     "no step at all": ("1x.2", "-AA-"),
-    "it begins in the middle": ("23", "--"),
     "late, and busy only then": ("1....b", "----AA"),
 }))
 def test_steps(events, expected):
@@ -126,13 +115,9 @@ POINTS = (Step("1", 0.4, at_least_s=0.2), Step("2", 0.3), Step("3", 0.6))
 # A slot is 100 ms; each event is a check point that is passed.
 @pytest.mark.parametrize(("events", "expected"), **table({
     "in order": ("1.23.1.23", "---------"),
-    "too soon": ("12", "-A"),
-    "right again with the next one": ("123.", "-A--"),
-    "just late enough": ("1.2", "---"),
-    "left out": ("1..3", "---A"),
-    "swapped": ("1..32", "---AA"),
+    "too soon, and right again with the next one": ("123.", "-A--"),
+    "left out, and swapped": ("1..32", "---AA"),
     "repeated": ("1.22", "---A"),
-    "the first one again": ("1.1", "--A"),
     "late": ("1....2", "----A-"),
     "never": ("1.2......", "-----AAAA"),
     "unknown": ("1.x", "--A"),
@@ -152,19 +137,9 @@ def test_after_steps_that_could_not_be_heard_any_step_may_be_the_next():
     assert monitor.active, "only the first one after it is believed"
 
 
-def test_a_step_is_not_busy_for_longer_than_it_may_be():
-    monitor = ProgressMonitor("task", STEPS, busy_at_most_s=0.2)
-    monitor.heard("1", 0.0)
-    monitor.busy(1e6)
-    assert monitor.due_s == pytest.approx(0.6)
-    monitor.busy(math.nan)
-    assert monitor.due_s == pytest.approx(0.4)
-
-
 # a, b, c ...: a value, A: the same as a, of a new process; x may last. The same for 300 ms is too
 # long; it then has to go on changing for 200 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
-    "it changes": ("abcabc", "------"),
     "it is always the same": ("aaaaaa", "---AAA"),
     "it is the same for a moment": ("aaabaaab", "--------"),
     "it goes on changing": ("aaaabcde", "---AAA--"),
@@ -172,7 +147,6 @@ def test_a_step_is_not_busy_for_longer_than_it_may_be():
     "silence is not the same": ("aa......", "--------"),
     "the same after silence": ("a...a", "----A"),
     "active, then silence: the last value stands": ("aaaa...", "---AAAA"),
-    "what may last": ("xxxxxx", "------"),
     "what may last is a change": ("aaaaxxx", "---AAA-"),
     "a new process is given time": ("aaAaaaa", "-----AA"),
 }))
@@ -218,13 +192,6 @@ def test_how_far_apart(one, other, angle, distance):
     assert apart(one, other, angle=angle) == pytest.approx(distance)
 
 
-@pytest.mark.parametrize(("values", "places"), [
-    ((1.0, 1.1, 5.0), [0, 1]), ((1.0, None, 5.0), [0]), ((None, None), []),
-    (("a", "b", "b"), [1, 2]), ((0.0, 0.1, 0.2), [0, 1, 2])])
-def test_who_agrees(values, places):
-    assert agreeing(values, 0.1 + 1e-9, angle=False) == places
-
-
 # -- on the bus --------------------------------------------------------------------------------
 
 
@@ -255,15 +222,12 @@ def levels(*heights: float, topic: Any = LEVEL) -> list[tuple[float, Any, Any]]:
 
 
 @pytest.mark.parametrize(("heights", "limits", "expected"), **table({
-    "above": ((1, 1, 3, 3, 3), {"above": 2.0}, [(0.3, "3 is above 2")]),
-    "and well again": ((3, 3, 1, 1, 1, 1), {"above": 2.0}, [(0.1, "3 is above 2"), (0.5, "")]),
+    "above": ((3, 3, 1, 1, 1, 1), {"above": 2.0}, [(0.1, "3 is above 2"), (0.5, "")]),
     "below": ((1, -1, -1), {"below": 0.0}, [(0.2, "-1 is below 0")]),
-    "outside": ((1, 1, 9), {"below": 0.0, "above": 8.0}, [(0.3, "9 is above 8")]),
     "no number": ((1, math.nan), {"above": 2.0}, [(0.2, "nan is not finite")]),
     "its sign does not matter": ((1, -3), {"above": 2.0, "absolute": True},
                                  [(0.2, "3 is above 2")]),
     "on the limit": ((2, 2), {"above": 2.0, "below": 2.0 - 1e-6}, []),
-    "for a moment": ((1, 3, 1, 1), {"above": 2.0, "for_s": 0.2}, []),
     "hysteresis": ((3, 1.9, 1.9, 1.9, 1.9), {"above": 2.0, "hysteresis": 0.5},
                    [(0.1, "3 is above 2")]),
 }))
@@ -297,14 +261,12 @@ def test_a_rate_is_reported():
     assert found[1][0] == pytest.approx(6.6)  # the fifth from last came at 5.6
 
 
-@pytest.mark.parametrize(("script", "for_s", "expected"), [
-    (levels(1, 1, 1, 1) + levels(1, 2, 2, 2, topic=SECOND), 0.1,
-     [(0.3, "active", "tank/level:height_m is 1, tank/second:height_m is 2")]),
-    (levels(1) + levels(*[9.0] * 30, topic=SECOND), 0.5, [])])  # who is silent is not compared
-def test_two_gauges_that_disagree(script, for_s, expected):
-    found = reports(Disagreement, sorted(script, key=lambda e: e[0]), 1.0, stale_s=0.3, for_s=for_s,
-                    one="tank/level:height_m", other="tank/second:height_m", more_than=0.5)
-    assert found[1:] == expected
+def test_two_gauges_that_disagree_are_reported_and_who_is_silent_is_not_compared():
+    script = sorted([*levels(1, 1, 1, 1), *levels(1, 2, 2, 2, 9, 9, 9, 9, 9, 9, topic=SECOND)],
+                    key=lambda entry: entry[0])
+    found = reports(Disagreement, script, 1.1, stale_s=0.3, for_s=0.1, more_than=0.5,
+                    one="tank/level:height_m", other="tank/second:height_m")
+    assert found[1] == (0.3, "active", "tank/level:height_m is 1, tank/second:height_m is 2")
 
 
 def test_two_of_three_have_to_agree():
@@ -400,7 +362,6 @@ def test_a_suspect_that_sends_nothing_itself_is_named_by_the_incarnation_of_that
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
     (Threshold, {"value": "a:b"}, "above = *: missing; give above, below or both"),
     (Threshold, {"value": "a:b", "above": 1.0, "below": 2.0}, "below = 2.0: must be smaller"),
-    (Threshold, {"value": "tank", "above": 1.0}, "value = 'tank'"),
     (Rate, {"topic": "a"}, "at_least_hz: missing"),
     (Rate, {"topic": "a", "at_least_hz": 5.0, "at_most_hz": 5.0}, "at_most_hz = 5.0: must be"),
     (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are only 2 values"),

@@ -72,11 +72,6 @@ def test_one_that_was_late_for_long_counts_for_as_long():
     assert [state for _, state in states(script, until_s=4.0)] == ["idle", "active"]
 
 
-def test_what_is_long_under_way_is_late_as_well():
-    script = [(1.0 + 0.1 * i, "abcd", 0.0) for i in range(5)]
-    assert [s for _, s in states(script, under_way_s=0.4, until_s=1.5)] == ["idle", "active"]
-
-
 @pytest.mark.parametrize(("waits_until_s", "idle_s"), [(0.0, 2.5), (3.2, 4.7), (99.0, 6.5)])
 def test_it_lasts_while_many_wait_for_a_processor_but_not_for_ever(waits_until_s, idle_s):
     script = [(1.0, "abc", 0.2)]

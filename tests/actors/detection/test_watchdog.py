@@ -121,28 +121,6 @@ class Node(Actor):
     """A node that does nothing but beat."""
 
 
-def test_a_killed_node_is_reported_without_any_time_passing():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            system.start("a", Node)
-            system.start("b", Node)
-            system.start("DM4", Watchdog, watch=["a", "b"], timeout_s=0.35)
-            await asyncio.sleep(1.0)
-            assert ear.states == ["idle"]
-            await system.kill("b")
-            killed_s = system.clock.now()
-            await system.settle()
-            at, report = ear.heard[-1]
-            assert (at, report.state, report.nodes) == (
-                killed_s, m.DetectionState.ACTIVE, ("b",))
-            system.start("b", Node)
-            await system.settle()
-            assert ear.states == ["idle", "active", "idle"]
-
-    run(scenario)
-
-
 def test_without_a_supervisor_a_node_whose_loop_hangs_is_reported_after_twice_the_timeout():
     async def scenario() -> None:
         async with System() as system:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rampart.actors.bus import messages as bm
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm.narrator import Line, Narrator
@@ -24,15 +23,6 @@ def test_a_detection_is_told_when_it_begins_and_when_it_ends():
         Line("clear", "Prohibited area (DM1): clear")]
 
 
-def test_a_silent_module_is_told_once():
-    def status(*silent):
-        return fm.ManagerStatus((), silent, (), (), "safety-first", 0, ())
-
-    assert told(status(), status("DM1"), status("DM1"), status()) == [
-        Line("fault", "Prohibited area (DM1) silent: it counts as active"),
-        Line("clear", "Prohibited area (DM1): no longer silent")]
-
-
 def test_processes_are_told_of_when_they_fail_and_come_back_and_not_of_their_start():
     def event(what, by="", detail=""):
         return fm.ProcessEvent("hmi", what, 7, 2, by, detail)
@@ -51,17 +41,3 @@ def test_a_decision_is_told_once_and_what_another_strategy_would_have_done():
         Line("fault", "decision 3: Emergency stop (RM1): Prohibited area (FTM1), because it is the "
                       "only active mechanism (block 1)."),
         Line("note", "in shadow mission-first would run nothing")]
-
-
-def test_an_injected_fault_is_named_by_what_it_does():
-    order = bm.Injection("f1", "summit_xl/gps", "drop", 2.0)
-    reports = [bm.InjectionReport("f1", "world", affected, finished, "")
-               for affected, finished in ((0, False), (3, False), (9, True))]
-    assert told(order, *reports) == [
-        Line("fault", "fault injected: drop summit_xl/gps at world"),
-        Line("clear", "injection over: drop summit_xl/gps at world, 9 messages changed")]
-
-
-def test_an_error_report_names_node_reason_and_offender():
-    assert told(bm.Diagnostic("hmi", "payload", "no struct", "DM1", 4)) == [
-        Line("note", "hmi: payload: no struct [DM1] (4 times)")]

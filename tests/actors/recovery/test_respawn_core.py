@@ -134,7 +134,7 @@ def test_a_new_life_that_dies_or_is_not_heard_is_asked_for_again(dies):
     rm = core()
     rm.event("a", "crashed", 3, "", 1.0)
     rm.order(["a", "z"], 1.0, renewed=False)
-    assert rm.problem == "z: not among the nodes that this module may respawn"
+    assert rm.problem.startswith("z: not among the nodes")
     rm.event("a", "respawned", 4, "", 1.1)
     assert [ask.node for ask in rm.take_requests()] == ["a"]
     if dies:

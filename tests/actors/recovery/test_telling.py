@@ -272,13 +272,6 @@ def layout(**changes: str) -> Layout:
     return Layout(RunPlan(system_file="tank.toml"), parse_specification(text, "tank.toml"))
 
 
-def test_the_topics_that_parameters_name_are_heard_and_published():
-    found = layout()
-    assert "tank/level" in found.members["D_LEVEL"].hears
-    assert "tank/order" in found.members["R_SHUT"].publishes
-    assert found.topics == {"tank/level": LEVEL, "tank/order": ORDER}
-
-
 @pytest.mark.parametrize(("changes", "line"), [
     ({"VALUE": "tank/levle:height_m"}, "D_LEVEL: parameters.value: no actor has a topic 'tank/le"),
     ({"VALUE": "tank/level:hieght_m"}, "D_LEVEL: parameters.value: topic tank/level: hieght_m: "),

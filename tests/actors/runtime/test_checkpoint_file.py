@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import socket
 import subprocess
@@ -223,20 +222,6 @@ def test_a_byte_that_is_wrong_anywhere_gives_way_to_the_state_before(tmp_path):
             records, problems = read(tmp_path, "node", "run")
             assert FORM.decode(1, records[0].state) == Counter(5), at
             assert len(problems) == 1, at
-
-
-def test_garbage_of_any_kind_is_one_line_and_the_node_runs(tmp_path):
-    whole = counted(tmp_path / "whole").read_bytes()
-    chance = random.Random(1)
-    for trial in range(200):
-        at, data = chance.randrange(len(whole)), chance.randbytes(chance.randrange(1, 400))
-        folder = tmp_path / f"{trial}"
-        folder.mkdir()
-        (folder / "node.1.1").write_bytes(
-            whole[:at] + data + whole[at + chance.randrange(len(data)):])
-        _, told = restarted(folder)
-        assert len(told) == 1
-        assert "\n" not in told[0]
 
 
 def bind(file: Path) -> None:

@@ -132,20 +132,10 @@ async def test_a_permanent_fault_sets_no_timer_and_never_ends(scene):
     scene.inject("drop", math.inf)
     await scene.system.settle()
     assert len(scene.talker._timers) == timers
-    await asyncio.sleep(1000.0)
-    assert scene.talker.said > 9000
+    await asyncio.sleep(100.0)
+    assert scene.talker.said > 900
     assert scene.listener.poses == []
     assert scene.listener.told == [(0, False, ""), (1, False, "")]
-
-
-@within(scene)
-async def test_a_permanent_fault_dies_with_its_process(scene):
-    scene.inject("drop", math.inf)
-    await asyncio.sleep(1.0)
-    await scene.system.kill("talker")
-    scene.system.start("talker", Talker)
-    await asyncio.sleep(0.55)
-    assert scene.listener.poses == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
 @within(scene)

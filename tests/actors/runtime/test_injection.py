@@ -11,9 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rampart.actors.bus.messages import Injection
-from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
 from rampart.actors.osmosis.messages import (
-    BaseStatus,
     Goal,
     Imu,
     LaserScan,
@@ -91,19 +89,6 @@ def test_what_freezes_before_its_first_message_repeats_that_one(mode):
     assert faults.expire("i") == 2
 
 
-def test_faults_on_one_topic_act_in_the_order_in_which_they_were_ordered():
-    faults = FaultGate()
-    for name, mode, fields in (("a", "corrupt", {"add_fields": {"x_m": 1.0}}),
-                               ("b", "corrupt", {"set_fields": {"y_m": 9.0}}),
-                               ("c", "duplicate", {}), ("d", "duplicate", {}),
-                               ("e", "delay", {"delay_s": 0.2}), ("f", "delay", {"delay_s": 0.3})):
-        assert faults.order(Injection(name, "localization/pose", mode, 5.0, **fields), 10.0) == ""
-    out = faults.apply(KEY, POSE, 10.0, 10.0)
-    assert (out.body, out.copies, out.delay_s) == (Pose(2.0, 9.0, 0.5), 3, 0.5)
-    faults.order(Injection("g", "localization/pose", "drop", 5.0), 10.0)
-    assert faults.apply(KEY, POSE, 10.0, 10.0) is None
-
-
 # -- which messages ----------------------------------------------------------------------------
 
 
@@ -119,18 +104,6 @@ def test_an_intermittent_fault_comes_and_goes_from_the_moment_of_injection(on_s,
     times_s = [10.0 + 0.5 * i for i in range(len(expected))]
     assert "".join("x" if out is None else "." for out in sent(faults, times_s)) == expected
     assert faults.expire("i") == expected.count("x")
-
-
-@pytest.mark.parametrize(("mode", "stamps"), [
-    ("freeze", [9.0, 9.0, 12.0, 13.0, 13.0, 13.0]),
-    ("stuck", [10.0, 11.0, 12.0, 13.0, 14.0, 15.0]),
-])
-def test_an_intermittent_freeze_repeats_what_was_healthy_last(mode, stamps):
-    faults = gate(mode, on_s=2.0, off_s=2.0)
-    sent(faults, [9.0])
-    out = sent(faults, [10.0, 11.0, 12.0, 13.0, 14.0, 15.0])
-    assert [x for x, *_ in out] == [9.0, 9.0, 12.0, 13.0, 13.0, 13.0]
-    assert [stamp for _, stamp, *_ in out] == stamps
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
@@ -153,14 +126,6 @@ def test_the_same_seed_strikes_the_same_messages_and_nothing_else_moves_it():
     random.seed(2)
     random.random()
     assert pattern(5) == first != pattern(6)
-    both = FaultGate()
-    both.order(Injection("i", "localization/pose", "drop", 5.0, share=0.5, seed=5), 10.0)
-    both.order(Injection("j", "plan/route", "drop", 5.0, share=0.5, seed=9), 10.0)
-    out = []
-    for _ in range(64):
-        both.apply("rampart/plan/route", POSE, 11.0, 11.0)
-        out.append(both.apply(KEY, POSE, 11.0, 11.0))
-    assert "".join("x" if o is None else "." for o in out) == first
 
 
 def test_noise_has_the_spread_it_was_ordered_with_and_comes_from_the_seed():
@@ -190,12 +155,6 @@ def test_a_route_keeps_its_ends_and_moves_as_a_whole():
     (MissionRequest("m", "", (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))),
      {"add_fields": {"goals.x_m": 10.0}},
      MissionRequest("m", "", (Goal(11.0, 2.0, Mode.TAXI), Goal(13.0, 4.0, Mode.TAXI)))),
-    (BaseStatus(False, False, 0.0, (1.0, 2.0, 3.0, 4.0)),
-     {"add_fields": {"wheel_speeds_radps": -1.0}},
-     BaseStatus(False, False, 0.0, (0.0, 1.0, 2.0, 3.0))),
-    (NodeTable((NodeInfo("a", "k", 42, NodeState.RUNNING, 1, 2),)),
-     {"add_fields": {"nodes.restarts": 3.0}},
-     NodeTable((NodeInfo("a", "k", 42, NodeState.RUNNING, 1, 5),))),
     (Route("m", 0, Mode.TAXI, True, (), ""),
      {"set_fields": {"mode": "light verification", "active": False}},
      Route("m", 0, Mode.LIGHT_VERIFICATION, False, (), "")),
@@ -226,12 +185,6 @@ def test_an_array_is_filled_ramped_and_biased_element_by_element(values, fill, r
         after = gate("corrupt", **fields).apply(KEY, before, 0.0, 10.0 + elapsed_s).body
         assert ranges(after).tolist() == expected.astype("<f4").tolist()
         assert after.range_max_m == before.range_max_m
-
-
-def test_the_noise_of_an_array_differs_from_element_to_element():
-    after = ranges(corrupted(scan([4.0] * 2000), noise_fields={"ranges_f32": 0.3}, seed=1))
-    assert len(set(after.tolist())) > 1900
-    assert np.std(after) == pytest.approx(0.3, rel=0.08)
 
 
 @given(yaw=st.floats(-math.pi, math.pi, exclude_min=True), bias=st.floats(-20.0, 20.0))
@@ -289,14 +242,11 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
 
 @pytest.mark.parametrize(("mode", "fields", "words"), [
     ("hug", {}, "mode = 'hug'"),
-    ("drop", {"duration_s": -1.0}, "duration_s = -1"),
     ("drop", {"duration_s": math.nan}, "duration_s = nan"),
-    ("delay", {"delay_s": -0.1}, "delay_s = -0.1"),
     ("delay", {"delay_s": math.inf}, "delay_s = inf"),
     ("delay", {}, "delay_s = 0"),
     ("restamp", {}, "stamp_s = 0"),
     ("drop", {"stamp_s": -math.inf}, "stamp_s = -inf"),
-    ("drop", {"share": 1.1}, "share = 1.1"),
     ("drop", {"share": math.nan}, "share = nan"),
     ("drop", {"on_s": 1.0}, "on_s = 1, off_s = 0"),
     ("drop", {"on_s": math.inf, "off_s": 1.0}, "on_s = inf"),
@@ -305,7 +255,6 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     ("corrupt", {"add_fields": {"x_m": math.inf}}, "add_fields 'x_m' = inf"),
     ("corrupt", {"noise_fields": {"x_m": -1.0}}, "noise_fields 'x_m' = -1"),
     ("corrupt", {"set_fields": {"z_m": 1.0}}, "'z_m': unknown in Odometry; known: pose"),
-    ("corrupt", {"set_fields": {"pose.x_m.a": 1.0}}, "'pose.x_m.a': unknown in Odometry"),
     ("corrupt", {"set_fields": {"pose.x_m": "far"}}, "'pose.x_m' = 'far': Expected `float`"),
     ("corrupt", {"add_fields": {"pose": 1.0}}, "'pose': Pose, expected a number"),
     ("corrupt", {"keep_ends": ("pose",)}, "keep_ends 'pose'"),
@@ -322,15 +271,11 @@ def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode,
 
 
 @pytest.mark.parametrize(("kind", "fields", "fits"), [
-    (LaserScan, {"set_fields": {"ranges_f32": 1}}, True),
     (LaserScan, {"set_fields": {"ranges_f32": b"1234"}}, True),
-    (LaserScan, {"set_fields": {"ranges_f32": "1"}}, False),
     (LaserScan, {"set_fields": {"ranges_f32": True}}, False),
     (Route, {"add_fields": {"step": 1.0}}, True),
     (Route, {"ramp_fields": {"step": 1.0}}, False),
-    (Route, {"noise_fields": {"step": 1.0}}, False),
     (Route, {"add_fields": {"active": 1.0}}, False),
-    (Route, {"add_fields": {"reason": 1.0}}, False),
     (Route, {"noise_fields": {"waypoints": 1.0}}, True),
     (Route, {"set_fields": {"mode": "flying"}}, False),
     (MissionRequest, {"ramp_fields": {"goals.x_m": 1.0}}, True),
