@@ -142,14 +142,6 @@ def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):
     assert not list(box.folder.glob("*/"))
 
 
-def test_a_failed_process_is_an_incident_without_any_decision(box):
-    box.second(5.0, crash(5.5))
-    box.seconds(6, 30)
-    box.writer.close()
-    [(incident, _path)] = box.kept
-    assert incident.cause == "localization crashed, incarnation 1"
-
-
 def test_overlapping_incidents_are_one_file(box):
     box.seconds(0, 30)
     box.second(30.0, decision(1, 30.0))
@@ -179,10 +171,10 @@ def test_decisions_in_a_row_are_bounded_in_length_and_size(tmp_path):
 
 
 def test_a_limit_below_the_size_of_an_incident_keeps_its_newest_part(tmp_path):
-    box = Box(tmp_path, Limits(before_s=600, after_s=5, limit_mb=0.6))
+    box = Box(tmp_path, Limits(before_s=600, after_s=5, limit_mb=0.1))
     for at_s in range(0, 400, 10):
-        box.second(float(at_s), poses=1000)
-        assert size(box.folder) < 0.8e6
+        box.second(float(at_s), poses=150)
+        assert size(box.folder) < 0.15e6
     box.second(400.0, decision(1, 400.0))
     box.seconds(401, 405)
     [(incident, path)] = incidents_in(box.folder)
@@ -208,7 +200,6 @@ def test_after_a_kill_of_everything_the_last_second_is_readable(tmp_path):
 
 
 def test_an_incident_that_the_death_of_the_launcher_cuts_off_is_marked(box):
-    box.seconds(0, 30)
     box.second(30.0, decision(1, 30.5))
     box.writer.close(is_cut_off=True)
     assert [(i.at_s, i.partial) for i, _ in box.kept] == [(30.5, "the run was cut off")]
@@ -255,7 +246,7 @@ def test_a_restarted_black_box_continues_the_incident(tmp_path):
     after.writer.abandon()
 
 
-def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path):
+def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path, monkeypatch):
     one, other = Box(tmp_path), Box(tmp_path, run="other")
     one.second(0.0, decision(1, 0.5))
     other.second(0.0, crash(0.5))
@@ -265,6 +256,7 @@ def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path):
     one.seconds(1, 30)
     other.seconds(1, 30)
     assert sorted(i.run for i, _ in one.kept) == ["other", "sample"]
+    monkeypatch.setattr("rampart.actors.recording.black_box._LOCK_S", 0.2)
     with pytest.raises(BagError, match="another black box"):
         Box(tmp_path, run="other", again=True)
     one.writer.close()
@@ -293,25 +285,6 @@ def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
         box.second(141.0)
     assert [i.name for i, _ in incidents_in(box.folder)] == [newest]  # it may still be extended
     box.writer.abandon()
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
-def test_a_disk_that_others_fill_costs_the_oldest_incidents(tmp_path):
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3M", "tmpfs", tmp_path], check=True)
-    try:
-        box = Box(tmp_path)
-        for at_s in range(0, 1000, 100):
-            box.second(float(at_s), decision(at_s + 1, at_s + 0.5), poses=4000)
-        oldest = incidents_in(box.folder)[0]
-        with contextlib.suppress(OSError), (tmp_path / "filled").open("wb", buffering=0) as file:
-            while True:
-                file.write(bytes(4096))
-        box.second(1000.0)
-        assert oldest not in incidents_in(box.folder)
-        assert ring.span_of(box.folder / "sample").last_s > 1000
-        box.writer.abandon()
-    finally:
-        subprocess.run(["umount", "-l", tmp_path], check=True)
 
 
 def test_a_wall_clock_that_jumps_back_disorders_nothing(box):
@@ -439,14 +412,6 @@ def test_a_recording_and_a_black_box_run_side_by_side(run, tmp_path):
     [incident] = kept(run)
     found = recorded(run, incident)
     assert found.keys[ftm_topics.DECISION.at()] == 1
-
-
-def test_the_death_of_the_launcher_keeps_the_last_seconds(run):
-    wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
-               30, "the black box does not begin")
-    run.process.kill()
-    wait_until(lambda: kept(run), 20, "nothing is kept")
-    assert [i.cause for i in kept(run)] == ["the run was cut off"]
 
 
 def test_a_folder_that_cannot_be_made_ends_it_with_one_line(run, tmp_path):

@@ -86,13 +86,6 @@ def test_a_message_of_a_topic_that_only_the_robot_knows_has_its_header_and_comes
     assert form.payload(text) == payload
 
 
-def test_a_message_of_a_topic_that_only_the_robot_knows_is_legible():
-    payload = pack(("driver", 1, 7, 3.25, {"speed_mps": 0.5}))
-    assert json.loads(form_of("rampart/porter/speed/driver").recorded(payload)[0]) == {
-        "source": "driver", "incarnation": 1, "sequence": 7, "stamp": 3.25,
-        "body": {"speed_mps": 0.5}}
-
-
 @settings(max_examples=60, deadline=None, database=None)
 @given(st.binary(max_size=40) | ANYTHING.map(msgspec.msgpack.encode))
 def test_garbage_comes_back_to_the_byte_and_says_that_it_is_none(payload):

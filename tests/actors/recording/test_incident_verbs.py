@@ -10,7 +10,6 @@ import time
 import pytest
 
 from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.incidents import state_folder
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
@@ -151,19 +150,6 @@ def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
     assert "respawned by RM4" in printed(capsys, "show")
 
 
-@pytest.mark.processes
-@pytest.mark.alone
-def test_a_state_folder_that_cannot_be_used_does_not_disturb_the_run(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    assert state_folder("x").parts[-2:] == ("rampart", "x")
-    with RealRun(tmp_path, CELL, "--duration", "6", "--black-box") as run:
-        code, result = run.result()
-    assert run.story.count("black box: ") == 1
-    assert "Not a directory" in run.story
-    assert code == 0, result
-
-
 @pytest.mark.parametrize(("arguments", "has_one"), [
     ([], True), (["--black-box"], True), (["--no-black-box"], False), (["--virtual"], False)])
 def test_a_real_run_on_one_machine_has_one(home, arguments, has_one):
@@ -195,11 +181,3 @@ def test_a_black_box_that_cannot_start_is_one_line(monkeypatch):
     with _black_box(plan, shipped_system(), lines.append) as keep_alive:
         keep_alive()
     assert lines == ["black box: cannot start: Resource temporarily unavailable"]
-
-
-@pytest.mark.processes
-@pytest.mark.alone
-def test_a_run_without_a_black_box_keeps_nothing(home, tmp_path):
-    with RealRun(tmp_path, CELL, "--duration", "3") as run:
-        run.result()
-    assert not home.exists()

@@ -32,7 +32,6 @@ from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.recording.bag_reader import BagReader, key_of
 from rampart.actors.recording.bag_writer import BagWriter
 from rampart.actors.recording.message_form import Forms, MessageForm
-from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_documents import collect
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli.main import main
@@ -47,7 +46,6 @@ from tests.actors.recording.samples import (
     AnsweringLauncher,
     documents,
     pose,
-    running,
     sample,
     write,
 )
@@ -109,25 +107,6 @@ async def test_readers_hear_every_payload_as_it_was_sent_garbage_and_nan_include
     assert (player.played, player.refused) == (len(sent), 0)
 
 
-async def test_a_recording_of_a_replay_is_the_recording(tmp_path, port):
-    """The whole way: recording, bus, tap, recorder, recording."""
-    sent = sample(60)
-    write(tmp_path / "first.mcap", sent)
-    player = Replay(tmp_path / "first.mcap", port=port, rate=4.0)
-    recorder = Recorder(port, tmp_path / "second.mcap")
-    recorder.open()
-    with running(recorder):
-        async with playing(player) as task:
-            await task
-
-    def content(path):
-        return [(key, form_of(key).payload(message.data))
-                for channel, message in BagReader(path).messages() if (key := key_of(channel))]
-
-    assert content(tmp_path / "second.mcap") == content(tmp_path / "first.mcap")
-    assert recorder.writer.gaps.lost() == {}
-
-
 async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
     sent = [*(pose(n + 1, n * 0.02) for n in range(5)),
             *(pose(n + 1, 0.1 + n * 0.02, incarnation=2) for n in range(5))]
@@ -182,12 +161,6 @@ async def test_what_lies_before_the_start_is_not_decoded_and_not_caught_up_with(
     assert sent[-1] - sent[0] > 0.9, "one each 0.2 s, never sooner"
 
 
-async def test_a_start_before_the_beginning_is_the_beginning(recording, port):
-    player = Replay(recording, port=port, start_s=-1000.0, rate=4.0)
-    await player.run(asyncio.Event())
-    assert player.played == len(sample())
-
-
 async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
         recording, port, monkeypatch):
     monkeypatch.setattr(Forms, "of", lambda *_: MessageForm(None))
@@ -225,18 +198,6 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(recording, t
     assert list(folder.iterdir()) == []
 
 
-async def test_the_rate_is_kept(tmp_path, port):
-    write(tmp_path / "run.mcap", [pose(n + 1, n * 0.1) for n in range(11)])
-    times = {}
-    for rate in (1.0, 10.0):
-        player = Replay(tmp_path / "run.mcap", port=port, rate=rate)
-        begun = time.monotonic()
-        await player.run(asyncio.Event())
-        times[rate] = time.monotonic() - begun
-    assert times[1.0] > 1.0  # never sooner
-    assert times[10.0] < times[1.0]
-
-
 async def test_tools_find_a_replay_and_give_it_no_orders(recording, port):
     async with playing(Replay(recording, port=port, loop=True)), reading(port):
         async with connect(port) as session:
@@ -261,17 +222,7 @@ async def test_who_names_no_port_means_the_robot_and_not_the_replay(recording, p
             assert run_info.find_run(port).replay_of
 
 
-def test_a_replay_does_not_take_the_number_of_whatever_lives(recording, port, monkeypatch):
-    monkeypatch.setattr(replaying, "find_processes", lambda: [
-        RunProcess(1, port, 1, ("localization",), 1)])
-    with pytest.raises(UsageError, match=f"--port {port}: belongs to a run"):
-        Replay(recording, port=port)
-    monkeypatch.setattr(replaying, "find_processes", lambda: [
-        RunProcess(1, port + 1, 1, ("localization",), 1)])
-    Replay(recording, port=port)
-
-
-def test_a_port_in_use_is_refused(recording, port, capsys):
+def test_a_port_in_use_is_refused(recording, port, capsys, monkeypatch):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port))
         taken.listen()
@@ -280,6 +231,10 @@ def test_a_port_in_use_is_refused(recording, port, capsys):
     with AnsweringLauncher(port, 0.0):  # none of whose nodes lives just now
         assert main(["replay", str(recording), "--port", str(port)]) == 2
     assert f"--port {port}: belongs to a run" in capsys.readouterr().err
+    node = RunProcess(1, port, 1, ("localization",), 1)
+    monkeypatch.setattr(replaying, "find_processes", lambda: [node])
+    with pytest.raises(UsageError, match=f"--port {port}: belongs to a run"):
+        Replay(recording, port=port)
 
 
 async def test_a_second_replay_on_the_same_port_is_refused(recording, port):

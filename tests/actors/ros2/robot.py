@@ -135,24 +135,6 @@ class Reporter(StandIn):
         self._goals(message)
 
 
-class Stranger(StandIn):
-    """Publishes an odometry that is not the robot's."""
-
-    count = 0
-
-    def declare(self) -> None:
-        """Declare it."""
-        self.say_odometry = self.publisher("/odom", ODOM_TYPE)
-
-    @every(0.05)
-    def step(self) -> None:
-        """Publish it."""
-        message = self.types.blank(ODOM_TYPE)
-        message.header.frame_id, message.pose.pose.position.x = "odom", 99.0
-        self.count += 1
-        self.say_odometry(message)
-
-
 class Asker(Actor):
     """Asks the base to shut, or something else, once a second, by the gateway's own topic."""
 

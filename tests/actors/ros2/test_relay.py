@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 import shutil
-import signal
+import sys
 import time
 
 import psutil
@@ -20,9 +20,10 @@ from rampart.actors.ros2.wire import UNKNOWN_GID, Qos
 from rampart.actors.supervision.kill_node import signal_node
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
-from tests.actors.ros2.test_against_ros import ROS
+from tests.actors.ros2.test_against_ros import PYTHON, ROS
 from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.ros2.test_live import MORE, Peer
+from tests.actors.ros2.test_reports import REPORTS
 from tests.cli.look.test_ros_verbs import checked
 from tests.real_tools import printed
 
@@ -85,7 +86,7 @@ def echoed(run, key, count=1):
     return [json.loads(line)["message"] for line in lines.splitlines()]
 
 
-MANY = """
+COUNT = """
 [[node]]
 name = "counter"
 actor = "tests.actors.ros2.robot:Asker"
@@ -97,7 +98,9 @@ goal = "/count"
 type = "test_msgs/action/Fibonacci"
 from = "count/goal"
 to = "count/state"
+"""
 
+MANY = COUNT + """
 [[node]]
 name = "activator"
 actor = "tests.actors.ros2.robot:Asker"
@@ -140,13 +143,18 @@ to = "camera/rate_is_set"
 answer = { well = "results[0].successful" }
 """
 
+KEPT = """
+[[node]]
+name = "navigation"
+command = ["sh", "-c", "exec {python} {peer} base >> {log}"]
+kind = "non-control"
+heartbeat = {{ key = "base/odometry", timeout_s = 2.0 }}
 
-NODES = """
 [[detection]]
 name = "D_NODES"
 title = "A node is missing, or the gateway is bypassed"
 actor = "rampart.actors.ros2.ros_nodes:RosNodes"
-parameters = { gateway = "gateway", nodes = ["/base"], alone = true }
+parameters = {{ gateway = "gateway", nodes = ["/base"], alone = true }}
 within_s = 2.0
 
 [[mechanism]]
@@ -154,7 +162,7 @@ name = "M_NODES"
 detect = "D_NODES"
 recover = "R_RESTART"
 event = "missing"
-against = { within_s = 5.0, hazard = "the robot stands" }
+against = {{ within_s = 5.0, hazard = "the robot stands" }}
 """
 
 
@@ -181,108 +189,89 @@ def test_topics_services_actions_states_and_parameters_over_dds(tmp_path, system
         assert peer.said("heard").count(0.0) == 1
 
 
-def idle(run):
-    run.wait_until(lambda: echoed(run, "detection/D_NODES")[0]["state"] == "idle", 10,
-                   "the node is missing still")
-
-
-def test_relay_and_gateway_come_back_and_a_missing_node_and_a_rival_are_reported(tmp_path, system):
-    with RealRun(tmp_path, system(NODES)) as run:
-        with Peer(PEER, "base") as peer:
-            run.wait_until(lambda: len(peer.said("heard")) > 40, 30, "no command")
-
-            def comes_back(gateway, relay):
-                run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
-                heard = len(peer.said("heard"))
-                run.wait_until(lambda: run.pid("gateway") not in {None, gateway}, 10,
-                               "no new gateway")
-                run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20,
-                               "no command any more")
-                assert set(peer.said("heard")) <= {0.5}
-
-            for number, line in ((signal.SIGKILL, "the relay to ROS 2 ended: signal 9"),
-                                 (signal.SIGSTOP, "the relay to ROS 2 hung: no answer for 1 s")):
-                gateway, relay = run.pid("gateway"), relay_of(run)
-                relay.send_signal(number)
-                run.wait_for(line, 10)
-                comes_back(gateway, relay)
-            gateway, relay = run.pid("gateway"), relay_of(run)
-            run.kill("gateway")
-            comes_back(gateway, relay)
-
-            idle(run)
-            peer.process.terminate()
-            run.wait_for("(D_NODES): /base: not in the graph of ROS 2", 10)
-            assert "/base" not in echoed(run, "ros2/gateway/graph")[0]["nodes"]
-        with Peer(PEER, "base") as peer:
-            run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command any more")
-            idle(run)
-            with Peer(PEER, "rival"):
-                run.wait_until(lambda: "two publishers, /base and /rival" in printed(
-                    run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"),
-                    10, "not refused")
-                assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
-                run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
-
-
-COMMAND = f"""
-[[node]]
-name = "navigation"
-command = ["{ROS / 'bin/python'}", "{PEER}", "base"]
-kind = "non-control"
-heartbeat = {{ key = "base/odometry", timeout_s = 2.0 }}
-"""
-
-
-def test_a_killed_gateway_leaves_a_command_alone_that_it_hears_and_a_stop_does_not(
+def test_what_is_killed_comes_back_alone_and_a_rival_and_a_missing_node_are_reported(
         tmp_path, system):
-    with RealRun(tmp_path, system(COMMAND)) as run:
-        run.sleep_until(1.0)
-        assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+    """A gateway or relay that died was blamed on the command whose heartbeat it passes on."""
+    log = tmp_path / "log"
+    log.touch()
+
+    def heard():
+        return [one["heard"] for one in map(json.loads, log.read_text().splitlines())
+                if "heard" in one]
+
+    with RealRun(tmp_path, system(KEPT.format(python=PYTHON, peer=PEER, log=log))) as run:
+        run.wait_until(lambda: len(heard()) > 40, 30, "no command")
         program = psutil.Process(signal_node("navigation", "CONT", run.port).pid)
-        for strike in (lambda: run.kill("gateway"), lambda: relay_of(run).suspend()):
-            gateway = run.pid("gateway")
+        for strike, line in (
+                (lambda: relay_of(run).kill(), "the relay to ROS 2 ended: signal 9"),
+                (lambda: relay_of(run).suspend(), "the relay to ROS 2 hung: no answer for 1 s"),
+                (lambda: run.kill("gateway"), "gateway crashed")):
+            gateway, relay = run.pid("gateway"), relay_of(run)
             strike()
+            run.wait_for(line, 10)
+            run.wait_until(lambda relay=relay: not relay.is_running(), 5, "the relay is left")
             run.wait_until(lambda killed=gateway: run.pid("gateway") not in {None, killed}, 10,
                            "no new gateway")
+            before = len(heard())
+            run.wait_until(lambda before=before: len(heard()) > before + 50, 20, "no command")
+            assert set(heard()) <= {0.5}
+        assert "navigation crashed" not in run.story  # with a time-out of 2 s
+
+        def idle():
+            return echoed(run, "detection/D_NODES")[0]["state"] == "idle"
+
+        run.wait_until(idle, 10, "the node is missing still")
+        with Peer(PEER, "rival"):
+            run.wait_until(lambda: "two publishers, /base and /rival" in printed(
+                run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"),
+                10, "not refused")
             assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
-        time.sleep(2.0)
-        assert "navigation crashed" not in run.story
-        assert signal_node("navigation", "STOP", run.port).pid == program.pid
-        run.wait_for("navigation crashed, incarnation 1: ", 10)
+            run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
+        run.wait_until(idle, 30, "the rival is there still")
+        program.terminate()
+        run.wait_for("(D_NODES): /base: not in the graph of ROS 2", 10)
         run.wait_for("navigation respawned by supervisor, incarnation 2", 10)
         assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
-        assert not program.is_running()
+        signal_node("navigation", "STOP", run.port)
+        run.wait_for("navigation crashed, incarnation 2: ", 10)
+        run.wait_for("navigation respawned by supervisor, incarnation 3", 10)
 
 
-def test_a_killed_node_is_detected_by_its_topic_before_it_leaves_the_graph(tmp_path, system):
-    path = system(NODES.replace('detect = "D_NODES"', 'detect = "D_NODES or D_SILENT"') + """
-[[detection]]
-name = "D_SILENT"
-title = "The odometry is silent"
-actor = "rampart.actors.detection.freshness:Freshness"
-parameters = { topic = "base/odometry", timeout_s = 0.5 }
-""")
-    with Peer(PEER, "base") as peer, RealRun(tmp_path, path) as run:
-        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
-        run.wait_until(lambda: echoed(run, "detection/D_SILENT")[0]["state"] == "idle", 10,
-                       "no odometry")
-        peer.process.kill()
-        run.wait_for("(D_SILENT)", 10)
-        assert "/base" in echoed(run, "ros2/gateway/graph")[0]["nodes"]
-        assert echoed(run, "detection/D_NODES")[0]["state"] == "idle"
+REPORTED = REPORTS[REPORTS.index('[[ros2]]\nsubscribe = "/diagnostics"'):]
+for old, new in {"/navigate_to_pose": "/count", "nav/state": "count/state", "planner*": "rep*",
+                 "count = 3\nwithin_s = 1.0": "", ', suspects = ["gateway"]': ""}.items():
+    assert old in REPORTED, old
+    REPORTED = REPORTED.replace(old, new)
 
 
-def test_messages_of_another_node_than_the_named_one_never_pass(tmp_path, system):
-    path = system()
-    path.write_text(path.read_text().replace('frame = "odom"\n',
-                                             'frame = "odom"\npublisher = "/base"\n'))
-    with RealRun(tmp_path, path) as run, Peer(PEER, "rival"):
-        run.wait_until(lambda: "published by /rival; expected /base" in printed(
-            run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"), 20,
-            "not refused")
-        with Peer(PEER, "base"):
-            assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+def test_statuses_lines_and_goals_that_other_nodes_report(tmp_path, system):
+    with Peer(PEER, "reporter") as peer, RealRun(tmp_path, system(COUNT + REPORTED)) as run:
+        run.wait_until(lambda: run.pid("gateway"), 30, "the run did not start")
+        with Peer("-P", "-m", "rampart.cli.main", "topic", "echo", "detection/*", "--json",
+                  "--port", str(run.port), python=sys.executable) as reports:
+            def until(module, state, reason=""):
+                def is_so():
+                    said = [line["message"] for line in list(reports.lines)
+                            if line["source"] == module]
+                    return bool(said) and said[-1]["state"] == state and (
+                        reason in said[-1]["reason"])
+                run.wait_until(is_so, 40, f"{module} is not {state}: {reason}")
+
+            for module in ("D_STATUS", "D_LOG", "D_GOAL", "D_OWN"):
+                until(module, "idle")
+            for word, module, reason in (("bad", "D_STATUS", "lidar: error: no data"),
+                                         ("log", "D_LOG", "reporter: no path")):
+                peer.ask(word)
+                until(module, "active", reason)
+                peer.ask("well")
+                until(module, "idle")
+            peer.ask("abort")
+            until("D_OWN", "active", "aborted")
+            until("D_GOAL", "active", "a goal aborted")
+            peer.ask("succeed")
+            until("D_GOAL", "idle")
+            peer.process.kill()
+            until("D_STATUS", "active", "lidar: no status for 2 s")
 
 
 # -- without a run ---------------------------------------------------------------------------------
@@ -399,16 +388,6 @@ async def test_an_environment_of_another_distribution_passes_nothing(domain):
     side.side.close()
 
 
-async def test_without_rclpy_the_reason_is_one_line(domain, tmp_path):
-    empty = tmp_path / "setup.bash"
-    empty.write_text("")
-    side = Side(domain, empty)
-    await side.until(lambda: side.lost)
-    assert str(side.lost[0]) == ("the relay to ROS 2 ended: exit code 1; ModuleNotFoundError: No "
-                                 "module named 'rclpy'")
-    side.side.close()
-
-
 def activate(monkeypatch, environment):
     """Activate a virtual environment, as its `bin/activate` does, without a sourced ROS 2."""
     for name in ("AMENT_PREFIX_PATH", "ROS_DISTRO"):
@@ -436,31 +415,18 @@ def test_the_check_finds_the_nodes_on_dds_in_the_active_environment(capsys, monk
         peer.wait_for("up")
         code, found = checked(capsys, system(MANY, setup=""))
     assert found["relay of gateway"] == (True, "rclpy")
-    assert found["subscribe /odom"] == (True, "/base, nav_msgs/msg/Odometry")
-    assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
-    assert found["call /base/shut"] == (True, "/base, std_srvs/srv/SetBool")
-    assert found["goal /count"] == (True, "/base, test_msgs/action/Fibonacci")
+    for what, kind in (("subscribe /odom", "nav_msgs/msg/Odometry"), ("publish /cmd_vel", TWIST),
+                       ("call /base/shut", "std_srvs/srv/SetBool"),
+                       ("goal /count", "test_msgs/action/Fibonacci")):
+        assert found[what] == (True, f"/base, {kind}")
     assert code == 0
 
 
-def test_the_check_finds_a_wrong_type_and_a_rival(capsys, system):
+def test_the_check_finds_wrong_and_missing_types_and_a_rival(capsys, system):
     with Peer(PEER, "wrong") as wrong, Peer(PEER, "rival") as rival, Peer(PEER, "base") as base:
         for peer in (wrong, rival, base):
             peer.wait_for("up")
-        code, found = checked(capsys, system())
-    assert code == 1
-    assert "/wrong has the type std_msgs/msg/String" in found["subscribe /odom"][1]
-    assert "/rival publishes it too" in found["publish /cmd_vel"][1]
-
-
-def test_the_check_without_rclpy_is_one_line_and_exit_code_2(refused, system, tmp_path):
-    (tmp_path / "empty.bash").write_text("")
-    error = refused("ros2", "check", "--system", system(setup="empty.bash"), "--json")
-    assert "No module named 'rclpy'" in error
-
-
-def test_a_type_that_the_environment_lacks_is_found(capsys, system):
-    code, found = checked(capsys, system("""
+        code, found = checked(capsys, system("""
 [[ros2]]
 publish = "/rampart/pose"
 type = "bond/msg/Status"
@@ -468,4 +434,12 @@ from = "base/wanted"
 fields = { heartbeat_period = "linear_mps" }
 """))
     assert code == 1
+    assert "/wrong has the type std_msgs/msg/String" in found["subscribe /odom"][1]
+    assert "/rival publishes it too" in found["publish /cmd_vel"][1]
     assert "this ROS 2 has no bond/msg/Status" in found["types"][1]
+
+
+def test_the_check_without_rclpy_is_one_line_and_exit_code_2(refused, system, tmp_path):
+    (tmp_path / "empty.bash").write_text("")
+    error = refused("ros2", "check", "--system", system(setup="empty.bash"), "--json")
+    assert "No module named 'rclpy'" in error

@@ -124,17 +124,12 @@ async def test_a_respawned_node_is_configured_and_activated_and_only_then_the_mo
 
 
 @within(played)
-async def test_a_node_that_activates_itself_is_accepted(case):
+async def test_a_node_that_activates_itself_or_has_no_life_cycle_is_accepted(case):
+    await case.die_and_come_back("guard", 1, state=None)
+    assert (case.report.phase.value, case.asks) == ("done", [])
     await case.die_and_come_back("planner", 1, state=ACTIVE)
     await case.play(0.5)
     assert (case.changes, case.report.phase.value) == ([], "done")
-
-
-@within(played)
-async def test_a_node_without_a_life_cycle_is_back_with_its_heartbeat(case):
-    await case.die_and_come_back("guard", 1, state=None)
-    assert case.report.phase.value == "done"
-    assert case.asks == []
 
 
 @pytest.mark.parametrize(("state", "next_states", "answers", "words"), [
