@@ -159,13 +159,3 @@ def test_a_laser_of_nonsense_costs_the_full_system_nothing(tmp_path, fault):
                          seed=3, faults=(parse_fault(fault),)))
     assert result.effective
     assert (result.safe, result.success) == (True, True), result.reasons
-
-
-@pytest.mark.parametrize("way", [
-    "zero", *(pytest.param(way, marks=pytest.mark.slow) for way in (
-        "negative", "tiny", "huge", "nan", "single", "short"))])
-def test_the_paper_s_system_with_one_laser_of_nonsense_stands(way):
-    result = run_job(Job(row="x", system="paper", options={"mission": "A", "obstacles": 2}, seed=3,
-                         faults=(parse_fault(f"{way}:summit_xl/scan@5+inf"),)))
-    assert result.effective
-    assert (result.safe, result.success) == (True, False)

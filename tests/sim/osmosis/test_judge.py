@@ -45,6 +45,7 @@ def test_every_point_in_order_and_mode_is_a_success():
 @pytest.mark.parametrize(
     ("timeline", "visited", "reason"),
     [
+        ("T" * 9, 0, "point 1 of 3 at (10, 0) was not reached, nearest 2.00 m"),
         ("TTTTTT", 0, "point 1 of 3 at (10, 0) was not reached, nearest 5.00 m"),
         ("-" * 31, 0, "point 1 of 3 at (10, 0) was not reached, nearest 0.00 m"),
         ("TTTTTTTTTTTTTTTTTTTTTTTTTTTTTTT", 1,
@@ -57,13 +58,6 @@ def test_a_point_not_reached_or_reached_in_the_wrong_mode_is_a_failure(timeline,
     judge = judged(timeline)
     found = judge.verdict()
     assert (found.success, found.safe, found.reasons) == (False, True, (reason,))
-    assert len(judge.visit_times_s) == visited
-
-
-@pytest.mark.parametrize(("offset_m", "visited"), [(1.09, 1), (1.11, 0)])
-def test_a_point_is_reached_within_the_arrival_radius(offset_m, visited):
-    judge = Judge(GOALS[:1])
-    judge.see(*sample(0, 10 + offset_m))
     assert len(judge.visit_times_s) == visited
 
 

@@ -73,17 +73,6 @@ def test_a_light_passed_without_a_measurement_is_gone_back_for_and_then_given_up
     assert ledger.is_complete(row)
 
 
-def test_a_successor_in_the_middle_of_a_detour_goes_back_again(ledger):
-    row = ledger.on_row(ROW)
-    ledger.confirm(shown())
-    assert ledger.detour(row, 6.0, ended=False).light == "L1"
-    successor = LightLedger(LIGHTS)
-    successor.restore(ledger.kept)
-    assert successor.detour(row, 6.0, ended=False) is None  # the Mission Manager may have it
-    successor.confirm(shown())
-    assert successor.detour(row, 6.0, ended=False).light == "L1"
-
-
 def test_lights_that_it_drives_round_are_left_out_without_taking_the_sensor_for_blind(ledger):
     row = ledger.on_row(ROW)
     ledger.confirm(shown())

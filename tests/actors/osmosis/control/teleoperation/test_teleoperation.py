@@ -139,24 +139,24 @@ async def desk(tmp_path, device="stick", **parameters):
         await asyncio.wait_for(asyncio.gather(*tasks), 10)
 
 
-async def test_a_held_stick_is_repeated_and_letting_go_stops_once_and_then_is_silence(tmp_path):
+async def test_a_joystick_from_plugging_in_to_pulling_out_and_in_again(tmp_path):
     async with desk(tmp_path) as it:
         await it.plug()
         it.tell(PRESS, FORWARD, LEFT)
         await it.until(lambda: m.Twist(1.0, 2.0) in it.page.commands)
-        assert await it.commands(5) == [m.Twist(1.0, 2.0)] * 5
+        it.page.publish(topics.JOYSTICK, m.Joystick(-1.0, 0.0, True))
+        await it.until(lambda: it.told("not followed"))
+        assert await it.commands(5) == [m.Twist(1.0, 2.0)] * 5, "it is repeated while it is held"
+        told = next(d for d in it.page.diagnostics if "not followed" in d.reason)
+        assert (told.offender, "stick has the stick" in told.reason) == ("page", True)
+        it.page.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
         it.tell(LET_GO)
         await it.until(lambda: STOP in it.page.commands)
         it.tell(LEFT)
         await asyncio.sleep(0.1)  # six periods of repetition
-        assert it.page.commands[-2:] == [m.Twist(1.0, 2.0), STOP]
-
-
-async def test_a_joystick_that_is_pulled_out_stops_and_drives_again_after_a_fresh_press(tmp_path):
-    async with desk(tmp_path) as it:
-        await it.plug()
-        it.tell(PRESS, FORWARD)
-        await it.until(lambda: m.Twist(1.0, 0.0) in it.page.commands)
+        assert it.page.commands[-2:] == [m.Twist(1.0, 2.0), STOP], "then it is silent"
+        it.tell(PRESS)
+        await it.until(lambda: it.page.commands[-1] != STOP)
         it.unplug()
         await it.until(lambda: it.page.commands[-1] == STOP)
         await it.until(lambda: it.told("lost"))
@@ -165,19 +165,7 @@ async def test_a_joystick_that_is_pulled_out_stops_and_drives_again_after_a_fres
         it.tell(record(BUTTON | INITIAL, 4, 1), record(AXIS | INITIAL, 1, -32767))
         it.tell(LET_GO, PRESS)
         await it.until(lambda: it.page.commands)
-        assert it.page.commands[0] == m.Twist(1.0, 0.0)
-
-
-async def test_a_page_does_not_drive_while_the_joystick_is_held_and_is_told(tmp_path):
-    async with desk(tmp_path) as it:
-        await it.plug()
-        it.tell(PRESS, FORWARD)
-        await it.until(lambda: m.Twist(1.0, 0.0) in it.page.commands)
-        it.page.publish(topics.JOYSTICK, m.Joystick(-1.0, 0.0, True))
-        await it.until(lambda: it.told("not followed"))
-        assert set(await it.commands(4)) == {m.Twist(1.0, 0.0)}
-        told = next(d for d in it.page.diagnostics if "not followed" in d.reason)
-        assert (told.offender, "stick has the stick" in told.reason) == ("page", True)
+        assert it.page.commands[0] == m.Twist(1.0, 0.0), "after a fresh press"
 
 
 async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_meanwhile(tmp_path):
