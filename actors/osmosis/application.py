@@ -52,7 +52,7 @@ class Osmosis(Application):
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
     model = "rampart.sim.osmosis.camera:AirportModel"
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
-    observer = "rampart.sim.osmosis.trial.injector:OsmosisObserver"
+    observer = "rampart.sim.osmosis.trial.mission_trial:OsmosisObserver"
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     examples = (
         ("--mission A --obstacles 2", "two obstacles on the way"),

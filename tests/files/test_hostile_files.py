@@ -21,8 +21,8 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
-from rampart.actors.osmosis.airport import mask
-from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport import graph_format as mask
+from rampart.actors.osmosis.airport.model import AirportError
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart

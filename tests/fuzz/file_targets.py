@@ -15,9 +15,9 @@ from mcap.writer import CompressionType, Writer
 from PIL import Image
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
-from rampart.actors.osmosis.airport.mask import allowed_area
+from rampart.actors.osmosis.airport.graph_format import allowed_area
+from rampart.actors.osmosis.airport.model import AirportError
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of, renumbered

@@ -20,7 +20,7 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     StickDecoder,
     StickMapping,
 )
-from rampart.actors.osmosis.page.missions import OSMOSIS_REQUESTS
+from rampart.actors.osmosis.page.hmi import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title

@@ -14,8 +14,15 @@ from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
 
 from rampart.actors.osmosis.airport import model
-from rampart.actors.osmosis.airport.errors import AirportError, Problem, readable
-from rampart.actors.osmosis.airport.model import Name, Point, Record, WorldTruth
+from rampart.actors.osmosis.airport.model import (
+    AirportError,
+    Name,
+    Point,
+    Problem,
+    Record,
+    WorldTruth,
+    readable,
+)
 from rampart.files import toml
 from rampart.files.plain_text import shown
 from rampart.files.reading import read_text

@@ -8,7 +8,7 @@ import pytest
 
 from rampart.actors.osmosis.airport.model import MissionGoal
 from rampart.actors.osmosis.messages import GroundTruth, Pose, Twist
-from rampart.sim.osmosis.trial.judge import Judge
+from rampart.sim.osmosis.trial.record import Judge
 
 # Three points along x: taxi to 10, lights to 20, taxi to 30.
 GOALS = (

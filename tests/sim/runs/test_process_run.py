@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.osmosis.messages import Twist
-from rampart.sim.osmosis.trial.run_end import WORLD_LATE_S, RunEnd
+from rampart.sim.osmosis.trial.mission_trial import WORLD_LATE_S, RunEnd
 from rampart.sim.runs.process_run import _RELINK_S, excused_s
 
 

@@ -11,7 +11,7 @@ from rampart.actors.osmosis.messages import (
     Mode,
     Twist,
 )
-from rampart.sim.osmosis.trial.run_end import (
+from rampart.sim.osmosis.trial.mission_trial import (
     ACCEPT_WITHIN_S,
     LOST_AFTER_S,
     SETTLE_S,

@@ -20,8 +20,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from rampart.actors.osmosis.control.following.escape import EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import (
+    EscapeLimits,
     Follower,
     Motion,
     MotionLimits,

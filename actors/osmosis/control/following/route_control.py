@@ -14,13 +14,13 @@ import math
 from collections.abc import Callable
 
 import msgspec
+import numpy as np
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck
-from rampart.actors.osmosis.control.following.blockage import BlockageWatch
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
 from rampart.actors.osmosis.control.following.light_ledger import LightsKept, RowInspection
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
@@ -28,10 +28,69 @@ from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
-from rampart.actors.osmosis.control.polyline import Array, Point, Polyline, Pose2
+from rampart.actors.osmosis.control.polyline import Array, Point, Polyline, Pose2, to_map
+from rampart.actors.osmosis.messages import Blockage
 from rampart.actors.osmosis.readings import is_odometry, is_pose
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.schema import SystemSpec
+
+BLOCKED_AFTER_S, PROGRESS_M = 3.0, 0.3
+"""Time without progress that counts as a blockage, and least progress along the route."""
+
+BLOCKAGE_M, BLOCKAGE_RAD = 3.0, math.radians(60)
+"""Greatest distance of its echo from the robot's centre, and greatest bearing."""
+
+
+class BlockageWatch:
+    """Detects whether something on one route blocks the robot, and since when.
+
+    The criterion is progress along the route, and not the state of the follower or the Safety
+    Pilot: a robot that turns back and forth in front of a crate is blocked too. An echo ahead is
+    required: a robot that a recovery holds on an empty runway is not blocked. Times are simulated
+    seconds.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Restart for another route."""
+        self._best_m = math.inf
+        self._since_s: float | None = None
+        self._place: Point | None = None
+
+    def update(self, to_go_m: float, pose: Pose2, points: Array, now_s: float) -> Blockage | None:
+        """Return the blockage, or None.
+
+        Args:
+            to_go_m: distance to the goal along the route.
+            pose: (x, y, yaw) in `map`.
+            points: laser echoes in `base_link`, shape (n, 2).
+            now_s: now.
+        """
+        if self._since_s is None or to_go_m < self._best_m - PROGRESS_M:
+            self._best_m, self._since_s, self._place = to_go_m, now_s, None
+            return None
+        if now_s - self._since_s < BLOCKED_AFTER_S:
+            return None
+        # The first echo stays the blockage, so that its place is stable while the robot turns.
+        self._place = self._place or nearest_ahead(points, pose)
+        if self._place is None:
+            return None
+        return Blockage(*self._place, self._since_s)
+
+
+def nearest_ahead(points: Array, pose: Pose2) -> Point | None:
+    """Return the nearest echo ahead of the robot as a point in `map`, or None."""
+    distance_m = np.hypot(points[:, 0], points[:, 1])
+    ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) <= BLOCKAGE_RAD
+    near = np.flatnonzero(ahead & (distance_m <= BLOCKAGE_M))
+    if not len(near):
+        return None
+    first = near[int(np.argmin(distance_m[near]))]
+    x_m, y_m = to_map(points[first:first + 1], *pose)[0].tolist()
+    return x_m, y_m
+
 
 PERIOD_S = 0.05
 

@@ -10,8 +10,12 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Point, show
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.planning.closures import Closures, without
-from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
+from rampart.actors.osmosis.control.planning.route_search import (
+    Closures,
+    PlannedRoute,
+    plan_route,
+    without,
+)
 from rampart.actors.osmosis.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from rampart.actors.osmosis.readings import is_pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission, load_with_truth
-from rampart.actors.osmosis.airport.mask import COLUMNS_PER_M, LEFT_M, ROWS_PER_M, TOP_M
+from rampart.actors.osmosis.airport.graph_format import COLUMNS_PER_M, LEFT_M, ROWS_PER_M, TOP_M
+from rampart.actors.osmosis.airport.model import AirportError
 
 TOML = """
 name = "Field"

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.airport.checks import mission_problems, problems
+from rampart.actors.osmosis.airport.formats import mission_problems, problems
 from rampart.actors.osmosis.airport.model import (
     Airport,
     Light,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.actors.osmosis.page.driving import effect
+from rampart.actors.osmosis.page.hmi import effect
 
 
 @pytest.mark.parametrize(("known", "works", "text"), [

@@ -13,7 +13,7 @@ from rampart.actors.osmosis.messages import (
     MissionStatus,
     Mode,
 )
-from rampart.actors.osmosis.page.missions import (
+from rampart.actors.osmosis.page.hmi import (
     MISSION_GIVE_UP_S,
     NO_REASON,
     ORDER_GIVE_UP_S,

@@ -12,7 +12,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.messages import Way
-from rampart.actors.osmosis.recovery.way_out import TOP_SPEED_MPS, Look, WayOut
+from rampart.actors.osmosis.recovery.emergency_stop import TOP_SPEED_MPS, Look, WayOut
 from rampart.testing import run
 from tests.actors.osmosis.driven_robot import driven
 

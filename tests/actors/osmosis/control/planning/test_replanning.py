@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.control.following.blockage import BlockageWatch
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
-from rampart.actors.osmosis.control.planning.closures import without
+from rampart.actors.osmosis.control.following.route_control import BlockageWatch
 from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
+from rampart.actors.osmosis.control.planning.route_search import without
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import Mode
 from rampart.actors.runtime.actor import Actor, on

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.airport.route_check import RouteCheck
-from rampart.actors.osmosis.control.planning.closures import without
-from rampart.actors.osmosis.control.planning.route_search import plan_route
+from rampart.actors.osmosis.control.planning.route_search import plan_route, without
 
 AIRPORT = load_airport("vallombre")
 CHECK = RouteCheck(AIRPORT)
