@@ -338,8 +338,7 @@ def _black_box(plan: RunPlan, spec: SystemSpec, say: Callable[[str], None]
                ) -> Iterator[Callable[[], None]]:
     """Start the black box; yield the function that keeps it alive, and reports its end once."""
     box = RecorderProcess(Order(
-        plan.base_port, plan.black_box, os.getppid(), black_box=spec.black_box or BlackBox(),
-        checkpoints=plan.checkpoints if spec.layers.checkpoints else ""))
+        plan.base_port, plan.black_box, os.getppid(), black_box=spec.black_box or BlackBox()))
     reported = ""
 
     def look(problem: Callable[[], str | None]) -> None:

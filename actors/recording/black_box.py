@@ -48,7 +48,6 @@ SYNC_S = 1.0
 _WATCHED = (topics.DETECTION, topics.DECISION, topics.PROCESS_EVENT)
 _SEGMENTS = 16
 _HOUSEKEEPING_S = 10.0
-_CHECKPOINT_BYTES = 8 << 20
 _LOCK_S = 5.0
 
 
@@ -60,7 +59,6 @@ class BlackBoxWriter:
         documents: description of the run.
         limits: `[black_box]` of the specification.
         origin_s: start of simulated time, monotonic seconds.
-        checkpoints: folder of the nodes' checkpoints; None without.
         again: whether it continues the ring of this part of the run.
         wall: returns Unix time.
 
@@ -73,10 +71,9 @@ class BlackBoxWriter:
     """
 
     def __init__(self, folder: Path, documents: Documents, limits: Limits, *, origin_s: float = 0.0,
-                 checkpoints: Path | None = None, again: bool = False,
-                 wall: Callable[[], float] = time.time) -> None:
+                 again: bool = False, wall: Callable[[], float] = time.time) -> None:
         self._system, self._folder = folder, folder / documents.run_id
-        self._limits, self._checkpoints, self._wall = limits, checkpoints, wall
+        self._limits, self._wall = limits, wall
         self._origin_s, self._rate = origin_s, documents.rate
         self._run = documents.run_id
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -192,8 +189,7 @@ class BlackBoxWriter:
         self._last = Incident(
             name=name, system=self._system.name, run=self._run, at=incidents.iso(wall_s),
             cause=one_line(cause), at_s=at_s, to_s=at_s + limits.after_s,
-            from_s=max(at_s - limits.before_s, self._begun_s, last.to_s if last else -math.inf),
-            checkpoints=_read_all(self._checkpoints))
+            from_s=max(at_s - limits.before_s, self._begun_s, last.to_s if last else -math.inf))
 
     def _describe_last(self) -> None:
         if self._last is not None and self._last is not self._described:
@@ -236,7 +232,6 @@ class BlackBox(RunListener):
         folder: folder of the system.
         limits: `[black_box]` of the specification.
         launcher: pid of the launcher.
-        checkpoints: folder of the nodes' checkpoints; None without.
         again: whether an earlier process of this run's black box has died.
     """
 
@@ -244,9 +239,9 @@ class BlackBox(RunListener):
     period_s, flush_s = PERIOD_S, SYNC_S
 
     def __init__(self, port: int, folder: Path, limits: Limits, *, launcher: int,
-                 checkpoints: Path | None = None, again: bool = False) -> None:
+                 again: bool = False) -> None:
         super().__init__(port, folder, launcher)
-        self._limits, self._checkpoints, self._again = limits, checkpoints, again
+        self._limits, self._again = limits, again
 
     def begin(self, info: RunInfo, frames: list[bytes]) -> None:
         """See `RunListener`."""
@@ -254,8 +249,7 @@ class BlackBox(RunListener):
         documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                             nodes=tuple(info.nodes), started=incidents.iso(time.time()))
         self._box = BlackBoxWriter(
-            self.path, documents, self._limits, origin_s=info.origin_s,
-            checkpoints=self._checkpoints, again=self._again)
+            self.path, documents, self._limits, origin_s=info.origin_s, again=self._again)
 
     def write(self, frames: list[bytes], turn_s: float) -> None:
         """See `RunListener`."""
@@ -295,17 +289,3 @@ def _locked(folder: Path) -> int:
             raise BagError(f"{folder}: another black box of this run writes there")
         time.sleep(0.1)
     return descriptor
-
-
-def _read_all(folder: Path | None) -> dict[str, bytes]:
-    """Return the newest files of a folder by name, of a limited size in total."""
-    found: dict[str, bytes] = {}
-    left = _CHECKPOINT_BYTES
-    for path in sorted(folder.iterdir()) if folder and folder.is_dir() else ():
-        try:
-            data = path.read_bytes() if path.stat().st_size <= left else b""
-        except OSError:  # replaced meanwhile
-            continue
-        left -= len(data)
-        found[path.name] = data
-    return found

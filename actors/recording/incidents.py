@@ -35,7 +35,6 @@ from rampart.actors.recording.ring import Ring, Span
 from rampart.actors.recording.run_documents import (
     NOT_CHOSEN,
     Documents,
-    File,
     recorded_system,
     restore,
 )
@@ -65,7 +64,6 @@ class Incident(msgspec.Struct, frozen=True, kw_only=True):
         from_s: begin of its recording.
         to_s: end of its recording.
         partial: why a part is missing; "" if none is.
-        checkpoints: state of each node at the begin, by file name.
     """
 
     name: str
@@ -77,7 +75,6 @@ class Incident(msgspec.Struct, frozen=True, kw_only=True):
     from_s: float
     to_s: float
     partial: str = ""
-    checkpoints: dict[str, bytes] = {}
 
 
 def state_folder(system: str) -> Path:
@@ -225,7 +222,7 @@ def write_recording(folder: Path, incident: Incident, path: Path) -> Incident:
         BagError: the description of the run cannot be read.
         OSError: the recording cannot be written.
     """
-    documents, views = _documents(folder, incident.checkpoints)
+    documents, views = _documents(folder)
     first_s, last_s = math.inf, -math.inf
     writer = BagWriter(path.open("wb"), documents, begin_s=incident.from_s, views=views,
                        time_zero_s=min(0.0, float(math.floor(incident.from_s))))
@@ -238,7 +235,7 @@ def write_recording(folder: Path, incident: Incident, path: Path) -> Incident:
             partial["the ring began later"] = None
         if last_s < incident.to_s - SLACK_S:
             partial["the ring ended earlier"] = None
-        done = msgspec.structs.replace(incident, checkpoints={}, partial=", ".join(partial))
+        done = msgspec.structs.replace(incident, partial=", ".join(partial))
         if first_s <= last_s:
             done = msgspec.structs.replace(done, from_s=first_s, to_s=last_s)
         writer.close({"ended": "the incident was over", "incident": done.name, "cause": done.cause,
@@ -305,7 +302,7 @@ def _free(run: Path, living: Collection[str]) -> Iterator[bool]:
             os.close(descriptor)
 
 
-def _documents(folder: Path, checkpoints: dict[str, bytes]) -> tuple[Documents, Views]:
+def _documents(folder: Path) -> tuple[Documents, Views]:
     """Return the documents of a run from its description, and its views.
 
     Raises:
@@ -319,9 +316,6 @@ def _documents(folder: Path, checkpoints: dict[str, bytes]) -> tuple[Documents, 
         known = msgspec.structs.replace(known, application=known.kind.restored(Path(restored)))
     with contextlib.suppress(ValueError):  # an actor whose module is missing
         own = own_topics(known.system)
-    files: list[File] = [*head.files, *(
-        (f"checkpoints/{name}", "application/octet-stream", data)
-        for name, data in checkpoints.items())]
     run = head.run
     try:
         nodes = msgspec.json.decode(run.get("nodes", "[]"), type=tuple[str, ...])
@@ -332,5 +326,5 @@ def _documents(folder: Path, checkpoints: dict[str, bytes]) -> tuple[Documents, 
     plain = msgspec.structs.replace(known, application=None)  # its options are in the plan
     return Documents(
         run_id=run.get("run_id", ""), title=run.get("title", ""), rate=rate, nodes=nodes, plan=plan,
-        started=run.get("started", ""), files=tuple(files), version=run.get("rampart_version", ""),
-        known=plain, own=own), known.views()
+        started=run.get("started", ""), files=tuple(head.files),
+        version=run.get("rampart_version", ""), known=plain, own=own), known.views()

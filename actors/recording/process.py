@@ -51,7 +51,6 @@ class Order(msgspec.Struct, frozen=True):
         overwrite: whether the file may exist.
         elsewhere: key expressions of what other hosts publish.
         black_box: limits of a black box; None for a recording.
-        checkpoints: folder of the checkpoints that a black box keeps; "" without.
         again: whether a black box follows another one of this run, which has died.
     """
 
@@ -61,7 +60,6 @@ class Order(msgspec.Struct, frozen=True):
     overwrite: bool = False
     elsewhere: tuple[str, ...] = ()
     black_box: Limits | None = None
-    checkpoints: str = ""
     again: bool = False
 
 
@@ -206,8 +204,7 @@ def _recorder(order: Order, path: Path) -> RunListener:
     if order.black_box is None:
         return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
                         elsewhere=order.elsewhere, credentials=_launchers)
-    return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again,
-                    checkpoints=Path(order.checkpoints) if order.checkpoints else None)
+    return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again)
 
 
 def _launchers(run: RunInfo) -> Credentials | None:

@@ -28,25 +28,25 @@ from rampart.actors.foreign.output_log import OutputLog
 from rampart.actors.foreign.program import log_folder, make_log_folder
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, RecoveryReport
-from rampart.actors.ros2.calls import (
+from rampart.actors.ros2.diagnostics import Diagnostics
+from rampart.actors.ros2.graph import RosGraph, misfits
+from rampart.actors.ros2.links import (
     ActionCall,
     OfferedService,
+    Publication,
     ServiceCall,
+    Subscription,
     answer_topic,
     check_call,
     request_topic,
 )
-from rampart.actors.ros2.diagnostics import Diagnostics
-from rampart.actors.ros2.graph import RosGraph, misfits
-from rampart.actors.ros2.links import Publication, Subscription
-from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_clock import NS, RosClock
+from rampart.actors.ros2.ros_nodes import GRAPH, RosGraphReport
 from rampart.actors.ros2.side import Mode, Side, Tls
 from rampart.actors.ros2.stand_in import side_of, wall_ns
-from rampart.actors.ros2.translation.mapping import Inward, Outward
-from rampart.actors.ros2.translation.mirror import topic_of
+from rampart.actors.ros2.translation.mapping import Inward, Outward, topic_of
 from rampart.actors.ros2.translation.tables import ROUTER, Ros2Link, read_links
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos

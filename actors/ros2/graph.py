@@ -59,13 +59,6 @@ class RosGraph:
         """Return the endpoint with a gid, None if the graph has none."""
         return self._by_gid.get(gid)
 
-    def topics(self) -> dict[str, list[Endpoint]]:
-        """Return the endpoints of each topic, by its name."""
-        found: dict[str, list[Endpoint]] = {}
-        for one in self.of(*_OF_TOPICS):
-            found.setdefault(one.topic, []).append(one)
-        return dict(sorted(found.items()))
-
 
 def misfits(here: Iterable[Endpoint], there: Iterable[Endpoint]) -> Iterator[str]:
     """Yield why endpoints exchange nothing, or less than they request.

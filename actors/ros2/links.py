@@ -1,22 +1,26 @@
-"""Topics that the gateway passes on between ROS 2 and the system."""
+"""Topics, services and actions that the gateway passes on between ROS 2 and the system."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
 import msgspec
 
+from rampart.actors.bus.bounds import Count, Text, clip
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos as BusQos
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ros2.graph import RosGraph
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import RosClock
-from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
+from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward, message_of
 from rampart.actors.ros2.translation.tables import Ros2Link
+from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import UNKNOWN_GID, Attachment, Qos
 from rampart.actors.runtime.clock import Clock
 
@@ -30,6 +34,14 @@ _ROUNDING = 0.999
 
 _ZEROS = 20
 """Messages of zeros that are published after the system has fallen silent."""
+
+_REQUEST, _RESPONSE = "_Request", "_Response"
+_GOAL, _SEND, _GET = "_Goal", "_SendGoal", "_GetResult"
+
+ENDS = {4: "succeeded", 5: "cancelled", 6: "aborted"}
+"""Status of a goal that has ended (action_msgs/msg/GoalStatus)."""
+
+_RESULT_WITHIN_S = 86_400.0
 
 
 class Gateway(Protocol):
@@ -210,3 +222,273 @@ class Publication:
             self._zeros += 1
             self._publish_zeros()
         self._gateway.call_later(silence_s / 2, self._stop_if_silent)
+
+
+
+
+class GoalState(Message, frozen=True):
+    """State of an action's goal.
+
+    `phase`: "sent", "accepted", "rejected", "succeeded", "cancelled", "aborted", or "unanswered".
+    `number` counts the goals that the gateway has sent.
+    """
+
+    number: Count
+    phase: Text
+    why: Text = ""
+
+
+def request_topic(link: Ros2Link, types: Types) -> Topic[Any]:
+    """Return the topic of a link's requests or goals, for a system that does not declare it.
+
+    Raises:
+        ValueError: the type is not known.
+    """
+    part = _GOAL if link.way == "goal" else _REQUEST
+    made = message_of(msgspec.structs.replace(_part(link, part), fields={}), types)
+    return Topic(link.from_, made, BusQos.COMMAND, 0.0, "",
+                 f"Requests to {link.name} of ROS 2, {link.type}.")
+
+
+def answer_topic(link: Ros2Link, types: Types) -> Topic[Any]:
+    """Return the topic of a link's answers, for a system that does not declare it.
+
+    Raises:
+        ValueError: the type is not known.
+    """
+    if link.way == "goal":
+        made: type[msgspec.Struct] = GoalState
+    elif link.way == "serve":
+        made = message_of(_part(link, _REQUEST), types)
+    else:
+        response = message_of(_part(link, _RESPONSE, link.answer), types)
+        made = msgspec.defstruct(
+            "Answer", [("done", bool), ("why", Text, ""), *(
+                (f.name, f.type | None, None) for f in msgspec.structs.fields(response))],
+            bases=(Message,), frozen=True)
+    what = "Requests to" if link.way == "serve" else "Answers of"
+    return Topic(link.to, made, BusQos.COMMAND, 0.0, "",
+                 f"{what} {link.name} of ROS 2, {link.type}.")
+
+
+def _part(link: Ros2Link, part: str, fields: Mapping[str, Any] | None = None) -> Ros2Link:
+    """Return a link to a part of its type, e.g. the request of a service."""
+    return msgspec.structs.replace(
+        link, type=f"{link.type}{part}", fields=link.fields if fields is None else fields)
+
+
+def _encoded(translate: Outward, message: Any, header: Header, link: Ros2Link, gateway: Gateway
+             ) -> bytes:
+    """Return an encoded request or goal.
+
+    Raises:
+        ValueError: it is out of date, e.g. after a stop of the gateway, or cannot be translated.
+    """
+    try:
+        age_s, most_s = gateway.clock.now() - header.stamp, max(link.max_age_s, link.within_s)
+        if age_s > most_s:
+            raise ValueError(f"{age_s:.3g} s old; expected at most {most_s:g} s")
+        return translate(message, gateway.time.stamp_ns(header.stamp), header)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"request of {header.source}: {error}") from None
+
+
+class ServiceCall:
+    """Calls a service of ROS 2 with each message of a topic of the system.
+
+    Args:
+        gateway: that calls.
+        link: row of the specification.
+        asks: topic of the requests.
+        answers: topic of the answers; it has a field `done`, and may have `why`.
+    """
+
+    def __init__(self, gateway: Gateway, link: Ros2Link, asks: Topic[Any], answers: Topic[Any]
+                 ) -> None:
+        types = gateway.node.types
+        self._gateway, self._link, self._answers = gateway, link, answers
+        self._request = Outward(_part(link, _REQUEST), types, asks.type, lenient=True)
+        self._response = _Response(link, types, answers.type)
+        self._ask = gateway.node.client(link.name, link.type)
+        self._is_under_way = False
+
+    def take(self, message: Any, header: Header) -> None:
+        """Call the service, unless a call is under way: the system repeats its requests."""
+        if self._is_under_way:
+            return
+        try:
+            payload = _encoded(self._request, message, header, self._link, self._gateway)
+        except ValueError as error:
+            self._publish(None, str(error))
+            return
+        self._is_under_way = True
+        self._ask(payload, self._link.within_s, lambda answer, why: self._gateway.enqueue(
+            None, partial(self._answered, answer, why)))
+
+    def _answered(self, answer: bytes | None, why: str) -> None:
+        self._is_under_way = False
+        self._publish(answer, why)
+
+    def _publish(self, answer: bytes | None, why: str) -> None:
+        try:
+            body = self._response(answer, why)
+        except ValueError as error:
+            self._gateway.refuse(self._link.name, str(error))
+            body = self._response(None, str(error))
+        self._gateway.emit(self._answers, body, None)
+
+
+class _Response:
+    """Translates the response of a service into a message of the system."""
+
+    def __init__(self, link: Ros2Link, types: Types, made: type[msgspec.Struct]) -> None:
+        known = {f.name for f in msgspec.structs.fields(made)}
+        if "done" not in known:
+            raise ValueError(f"to: {made.__name__} has no field 'done'; expected one that is true "
+                             "when the service has answered")
+        self._made, self._has_why = made, "why" in known
+        self._decode = types.decoder(f"{link.type}{_RESPONSE}")
+        given: dict[str, Any] = {"done": True, **({"why": "''"} if self._has_why else {})}
+        self._translate = Inward(msgspec.structs.replace(
+            _part(link, _RESPONSE, {**link.answer, **given}), frame=""), types, made)
+
+    def __call__(self, answer: bytes | None, why: str) -> msgspec.Struct:
+        """Return the message; raises ValueError if the answer is not such a response."""
+        if answer is None:
+            words = {"why": clip(why)} if self._has_why else {}
+            return msgspec.convert({"done": False, **words}, self._made)
+        return self._translate(self._decode(answer))[0]
+
+
+class OfferedService:
+    """Offers a service to ROS 2: publishes each request, and answers it at once.
+
+    Args:
+        gateway: that offers it.
+        link: row of the specification, with the answer.
+        topic: of the system, for the requests.
+    """
+
+    def __init__(self, gateway: Gateway, link: Ros2Link, topic: Topic[Any]) -> None:
+        types = gateway.node.types
+        self._gateway, self._topic = gateway, topic
+        self._decode = types.decoder(f"{link.type}{_REQUEST}")
+        self._translate = Inward(_part(link, _REQUEST), types, topic.type)
+        self._response = _fixed_response(link, types)
+        gateway.node.serve(link.name, link.type, self._answer)
+
+    def _answer(self, payload: bytes) -> bytes:
+        body, _ = self._translate(self._decode(payload))
+        self._gateway.enqueue(None, lambda: self._gateway.emit(self._topic, body, None))
+        return self._response
+
+
+def _fixed_response(link: Ros2Link, types: Types) -> bytes:
+    """Return the encoded response of an offered service.
+
+    Raises:
+        ValueError: a field does not exist, or does not take its value.
+    """
+    name = f"{link.type}{_RESPONSE}"
+    blank = types.blank(name)
+    known = dict(types.fields(name))
+    for field, value in link.answer.items():
+        if field not in known:
+            raise ValueError(f"answer: {name} has no field {field!r}; known: {', '.join(known)}")
+        setattr(blank, field, value)
+    return types.encode(name, blank)
+
+
+class ActionCall:
+    """Sends each message of a topic of the system as a goal to an action; a new goal replaces it.
+
+    Args:
+        gateway: that sends.
+        link: row of the specification.
+        asks: topic of the goals.
+        answers: topic of `GoalState`.
+    """
+
+    def __init__(self, gateway: Gateway, link: Ros2Link, asks: Topic[Any], answers: Topic[Any]
+                 ) -> None:
+        self._gateway, self._link, self._answers = gateway, link, answers
+        self._types = gateway.node.types
+        self._goal = Outward(_part(link, _GOAL), self._types, asks.type, lenient=True)
+        where = f"{link.name}/_action"
+        self._send = gateway.node.client(f"{where}/send_goal", f"{link.type}{_SEND}")
+        self._get = gateway.node.client(f"{where}/get_result", f"{link.type}{_GET}")
+        self._number = 0
+
+    def take(self, message: Any, header: Header) -> None:
+        """Send a goal."""
+        gateway, types, kind = self._gateway, self._types, self._link.type
+        self._number += 1
+        number = self._number
+        try:
+            goal = types.decode(f"{kind}{_GOAL}", _encoded(
+                self._goal, message, header, self._link, gateway))
+        except ValueError as error:
+            self._publish(number, "rejected", str(error))
+            return
+        request = types.blank(f"{kind}{_SEND}{_REQUEST}")
+        request.goal = goal
+        request.goal_id.uuid[:] = list(os.urandom(16))
+        self._publish(number, "sent")
+        self._send(types.encode(f"{kind}{_SEND}{_REQUEST}", request), self._link.within_s,
+                   lambda answer, why: gateway.enqueue(None, partial(
+                       self._sent, number, request.goal_id, answer, why)))
+
+    def _sent(self, number: int, goal_id: Any, answer: bytes | None, why: str) -> None:
+        kind = self._link.type
+        try:
+            is_accepted = answer is not None and self._types.decode(
+                f"{kind}{_SEND}{_RESPONSE}", answer).accepted
+        except ValueError as error:
+            answer, why, is_accepted = None, str(error), False
+        if not is_accepted:
+            self._publish(number, "unanswered" if answer is None else "rejected", why)
+            return
+        self._publish(number, "accepted")
+        request = self._types.blank(f"{kind}{_GET}{_REQUEST}")
+        request.goal_id = goal_id
+        self._get(self._types.encode(f"{kind}{_GET}{_REQUEST}", request), _RESULT_WITHIN_S,
+                  lambda answer, why: self._gateway.enqueue(None, partial(
+                      self._ended, number, answer, why)))
+
+    def _ended(self, number: int, answer: bytes | None, why: str) -> None:
+        try:
+            if answer is None:
+                raise ValueError(why)
+            status = self._types.decode(f"{self._link.type}{_GET}{_RESPONSE}", answer).status
+            self._publish(number, ENDS.get(int(status), "aborted"))
+        except ValueError as error:
+            self._publish(number, "unanswered", str(error))
+
+    def _publish(self, number: int, phase: str, why: str = "") -> None:
+        if number == self._number:  # a goal that was replaced is not reported any more
+            self._gateway.emit(self._answers, GoalState(number, phase, clip(why)), None)
+
+
+def check_call(link: Ros2Link, types: Types, asks: Any, answers: Any) -> None:
+    """Refuse a call, offered service or action that cannot be translated.
+
+    Args:
+        link: row of the specification.
+        types: of ROS 2.
+        asks: type of the messages of `from`.
+        answers: type of the messages of `to`.
+
+    Raises:
+        ValueError: a type or field does not exist.
+    """
+    if link.way == "goal":
+        Outward(_part(link, _GOAL), types, asks, lenient=True)
+        types.hash(f"{link.type}{_SEND}")
+    elif link.way == "serve":
+        Inward(_part(link, _REQUEST), types, answers)
+        _fixed_response(link, types)
+        types.hash(link.type)
+    else:
+        Outward(_part(link, _REQUEST), types, asks, lenient=True)
+        _Response(link, types, answers)
+        types.hash(link.type)

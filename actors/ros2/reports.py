@@ -19,7 +19,7 @@ from rampart.actors.bus.fields import NUMBER, TEXT, Field
 from rampart.actors.bus.topic import Topic
 from rampart.actors.detection.finding import Recurrent, Sustained
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.ros2.calls import ENDS
+from rampart.actors.ros2.links import ENDS
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import Suspects, TopicHeard
 from rampart.files.plain_text import one_line

@@ -12,14 +12,35 @@ from typing import Annotated, Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.bus.bounds import Count, Names, Texts
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Members, Qos, Topic
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.translation.tables import RosName
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeName, Suspects
 from rampart.manager.spec.tables import NonNegative
+
+
+class RosGraphReport(Message, frozen=True, omit_defaults=True):
+    """Nodes of ROS 2 by full name, names that several nodes have, and problems.
+
+    `bypassed` counts other publishers on the gateway's topics: their messages reach the robot
+    without any check. `refused` counts messages that were not passed on.
+    """
+
+    linked: bool
+    nodes: Names
+    several: Names
+    bypassed: Count
+    problems: Texts
+    refused: Count = 0
+
+
+GRAPH = Topic("ros2/{name}/graph", RosGraphReport, Qos.STATE, 1, "",
+              "Nodes of ROS 2 that gateway {name} sees; at once when they change.")
+
 
 _GRACE_S = 5.0
 

@@ -25,7 +25,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.ros2.messages import GRAPH, RosGraphReport
+from rampart.actors.ros2.ros_nodes import GRAPH, RosGraphReport
 from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.cli import completion, systems
 from rampart.cli.following import is_over

@@ -159,7 +159,7 @@ def export(options: argparse.Namespace) -> int:
     """Copy an incident.
 
     Write the recording of an incident: an MCAP file with all messages, and with
-    specification, versions, options, files and checkpoints attached. It opens in
+    specification, versions, options and files attached. It opens in
     viewers, and with `rampart bag` and `rampart replay` on any machine.
 
     Examples:
@@ -310,9 +310,8 @@ def _recording(name: str | None) -> Iterator[Kept]:
 
 
 def _data(kept: Kept) -> dict[str, Any]:
-    shown = msgspec.to_builtins(kept.incident)
-    del shown["checkpoints"]
-    return {**shown, "partial": kept.state, "file": str(kept.path) if kept.path.exists() else None}
+    return {**msgspec.to_builtins(kept.incident), "partial": kept.state,
+            "file": str(kept.path) if kept.path.exists() else None}
 
 
 def _day(at_s: float) -> str:

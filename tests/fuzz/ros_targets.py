@@ -11,8 +11,7 @@ from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.translation.forms import READY
-from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError
-from rampart.actors.ros2.translation.mirror import topic_of
+from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError, topic_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos, gid_of

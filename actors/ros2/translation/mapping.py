@@ -5,18 +5,167 @@ Fields are looked up when a link is read, so a field that does not exist is refu
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol, get_args
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Annotated, Any, Protocol, get_args
 
 import msgspec
 import numpy as np
+from rosbags.interfaces import Nodetype
 
+from rampart.actors.bus.bounds import MOST, Count, Floats32, Meta, Text, Whole, clip
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, reader, steps
-from rampart.actors.ros2.translation.fields import TypeFields, near, plain, reads_of
-from rampart.actors.ros2.translation.forms import ON_PLANE, READY, UNBOUNDED, UNKNOWN, WRITTEN
+from rampart.actors.ros2.translation.forms import (
+    ON_PLANE,
+    READY,
+    UNBOUNDED,
+    UNKNOWN,
+    WRITTEN,
+    kind_of,
+    may_be_unknown,
+)
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
+
+BULK = ("uint8", "int8", "byte", "char")
+"""A list of these is an image, a point cloud or a map; the system gets its length only."""
+
+LEN = "_len"
+"""Suffix of the field with that length."""
+
+
+class TypeFields:
+    """The fields of a type of ROS 2, by path.
+
+    Args:
+        types: of ROS 2.
+        name: name of the type.
+
+    Raises:
+        ValueError: the type is not known.
+    """
+
+    def __init__(self, types: Types, name: str) -> None:
+        self._types, self._name = types, name
+        self.names = [field for field, _ in types.fields(name)]
+
+    def kind(self, path: str, said: str = "") -> str:
+        """Return the name of a field's type, with "[]" for a list; "" for a missing `header`.
+
+        Args:
+            path: of the field.
+            said: expression that contains the path, for messages.
+
+        Raises:
+            ValueError: there is no such field.
+        """
+        what = self._what(path, said)
+        return _kind_of(what) if what else ""
+
+    def _what(self, path: str, said: str) -> Any:
+        """Return a field's type as `rosbags` describes it; None for a missing `header`."""
+        what: Any = (Nodetype.NAME, self._name)
+        for step in steps(path, said):
+            kind, detail = what
+            if isinstance(step, int):
+                if kind not in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+                    raise ValueError(f"{said or path!r}: cannot index [{step}]: not a list")
+                what = detail[0]
+                continue
+            if kind != Nodetype.NAME:
+                raise ValueError(f"{said or path!r}: no field {step}: not a message")
+            name = detail
+            known = dict(self._types.fields(name))
+            if step not in known:
+                if path == step == "header":
+                    return None
+                raise ValueError(f"{said or path!r}: {name} has no field {step!r}"
+                                 f"{near(step, known)}")
+            what = known[step]
+        return what
+
+    def writer(self, where: str) -> Callable[[Any], Any]:
+        """Return a function that converts a value to the type of a field.
+
+        Raises:
+            ValueError: there is no such field, or it is a message.
+        """
+        kind = self.kind(where)
+        if kind == "geometry_msgs/msg/Quaternion" or kind.endswith("[]"):
+            return partial(self._types.field_like, self._what(where, where))
+        if "/" in kind:
+            raise ValueError(f"fields: {where} is a {kind}; expected one of its fields")
+        if kind.startswith("float"):
+            return _finite
+        return _ENCODED.get(kind, int)
+
+
+def _kind_of(what: Any) -> str:
+    kind, detail = what
+    if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+        return f"{_kind_of(detail[0])}[]"
+    return str(detail if kind == Nodetype.NAME else detail[0])
+
+
+_ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
+
+
+def near(name: str, known: Any) -> str:
+    """Return the end of an error text: a similar name, or all known names."""
+    found = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {found[0]}?" if found else f"; known: {', '.join(known) or 'none'}"
+
+
+def plain(value: Any) -> Any:
+    """Return a value of ROS 2 as numbers, texts, lists and dictionaries; long texts are cut."""
+    if isinstance(value, str):
+        return clip(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    fields = getattr(value, "__dataclass_fields__", None)
+    if fields is None:
+        return value
+    found = {}
+    for name, field in fields.items():
+        if field.type.startswith("ClassVar"):  # a constant
+            continue
+        inner = getattr(value, name)
+        if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
+            found[f"{name}{LEN}"] = len(inner)
+        else:
+            found[name] = plain(inner)
+    return found
+
+
+def _finite(value: float) -> float:
+    """Return a number; raises ValueError if it is not finite, so that it moves no wheel."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value}: expected a finite number")
+    return float(value)
+
+
+_ONE_BYTE = (np.uint8, np.int8)
+
+
+def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
+    """Return the fields of a type, nested ones included, each with the expression that reads it."""
+    found: dict[str, str] = {}
+    for field, (kind, detail) in types.fields(name):
+        path = f"{above}{field}"
+        if kind == Nodetype.NAME:
+            found |= reads_of(detail, types, f"{path}.")
+        elif kind != Nodetype.BASE and detail[0][1][0] in BULK:
+            found[f"{path}{LEN}"] = f"count({path})"
+        else:
+            found[path] = path
+    return found
+
 
 NS = 1_000_000_000
 
@@ -296,3 +445,110 @@ def _leaves(made: type[msgspec.Struct], above: str = ""
             yield from _leaves(kind, f"{path}.")
         else:
             yield path, field
+
+
+_BOUNDED: dict[Any, Any] = {bytes: Floats32, str: Text, float: float, bool: bool, int: Whole}
+
+
+def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
+    """Return the topic of a link's `to`, for a system that does not declare it.
+
+    Raises:
+        ValueError: the type is not known, or a field is wrong; one line.
+    """
+    if link.publishers == "any":  # the latest message of one says nothing about the others
+        qos = Qos.COMMAND
+    else:
+        qos = Qos.STATE if link.transient_local else Qos.SENSOR
+    return Topic(link.to, message_of(link, types), qos, link.rate_hz or 0.0, link.frame,
+                 f"{link.name} of ROS 2, {link.type}.")
+
+
+def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
+    """Return the type of the messages of `topic_of`; raises as it does."""
+    ready = dict(READY.get(link.type, {}))
+    if link.datum and link.type == "sensor_msgs/msg/NavSatFix":
+        ready |= ON_PLANE
+    if not ready and not link.fields:
+        return _mirrored(link.type, types, {})
+    if link.type != TF:
+        fields = TypeFields(types, link.type)
+        plane = Plane(link.datum) if link.datum else None
+        kinds = {name: _python_type(said, fields, plane) for name, said in link.fields.items()}
+    else:
+        kinds = dict.fromkeys(link.fields, float)
+    for name in kinds:
+        if not name.isidentifier():
+            raise ValueError(f"fields: {name!r}: expected a name, e.g. speed_mps")
+    kinds = {name: kind_of(name) for name in ready} | kinds
+    made: list[Any] = []
+    for name, kind in kinds.items():
+        what: Any = _BOUNDED.get(kind, kind)
+        is_known = name in link.fields or not may_be_unknown(link.type, ready[name])
+        made.append((name, what) if is_known else (name, what | None, None))
+    return msgspec.defstruct(
+        link.type.rpartition("/")[2], made, bases=(Message,), frozen=True, kw_only=True)
+
+
+def _python_type(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> Any:
+    """Return the Python type of an expression's value."""
+    if not isinstance(said, str):
+        return type(said)
+    if said.startswith(BESIDE):
+        return float
+    expression = Expression(said, plane)
+    if not expression.paths:
+        return str
+    if said.strip() != expression.paths[0]:
+        return int if said.strip().startswith("count(") else float
+    kind = fields.kind(said.strip(), said)
+    found = _base(kind.removesuffix("[]"))
+    if found is None:
+        raise ValueError(f"fields: {said!r} is a {kind}; expected one of its fields")
+    return _listed(found) if kind.endswith("[]") else found
+
+
+def _listed(item: Any) -> Any:
+    """Return the type of a bounded list."""
+    items: Any = tuple[item, ...]
+    return Annotated[items, Meta(max_length=MOST)]
+
+
+def _base(kind: str) -> type | None:
+    if kind.endswith("[]") or "/" in kind:
+        return None
+    return {"string": str, "bool": bool}.get(kind, float if kind.startswith("float") else int)
+
+
+def _mirrored(name: str, types: Types, made: dict[str, type[msgspec.Struct]]
+              ) -> type[msgspec.Struct]:
+    """Return a struct with the fields of a type of ROS 2, and its defaults.
+
+    Args:
+        name: of the type.
+        types: all types.
+        made: structs of the message so far; a JSON schema needs one class for each name.
+    """
+    if name in made:
+        return made[name]
+    fields, blank = [], types.blank(name)
+    for field, what in types.fields(name):
+        kind, detail = what
+        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE} and detail[0][1][0] in BULK:
+            fields.append((f"{field}{LEN}", Count, 0))
+        else:
+            made_of = _type_of(what, types, made)
+            fields.append((field, made_of, msgspec.convert(plain(getattr(blank, field)), made_of)))
+    made[name] = msgspec.defstruct(
+        name.rpartition("/")[2], fields, bases=(Message,), frozen=True)
+    return made[name]
+
+
+def _type_of(what: Any, types: Types, made: dict[str, type[msgspec.Struct]]) -> Any:
+    kind, detail = what
+    if kind == Nodetype.NAME:
+        return _mirrored(detail, types, made)
+    if kind == Nodetype.BASE:
+        return _BOUNDED[_base(detail[0])]
+    inner, _ = detail
+    return _listed(_type_of(inner, types, made))

@@ -258,7 +258,7 @@ def test_what_is_missing_shows_in_the_numbers(from_start, heard, lost):
 # ---- torn, damaged, foreign -----------------------------------------------------------------
 
 
-def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_unit_and_description(
+def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_and_description(
         tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "beside_it.py").write_text("from tests.porter_actors import Display, Platform\n")
@@ -274,7 +274,7 @@ def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_unit_and_descri
         [(schema, channel, message)] = make_reader(file).iter_messages()
     body = json.loads(schema.data)["properties"]["body"]
     assert body["description"] == "What it carries."
-    assert body["properties"]["mass_kg"] == {"type": "number", "unit": "kg"}
+    assert body["properties"]["mass_kg"] == {"type": "number"}
     assert (channel.metadata["about"], channel.metadata["frame"]) == (LOAD.doc, LOAD.frame)
     assert json.loads(message.data)["body"] == {"mass_kg": 20.0}
 

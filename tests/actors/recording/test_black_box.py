@@ -46,7 +46,7 @@ def crash(at_s, node="localization"):
 class Box:
     """A black box that is handed a second of messages at a time."""
 
-    def __init__(self, folder, limits=LIMITS, *, checkpoints=None, run="sample", again=False):
+    def __init__(self, folder, limits=LIMITS, *, run="sample", again=False):
         self.folder = folder / "paper"
         self.now = 1_800_000_000.0
         self.sent = 0
@@ -56,7 +56,7 @@ class Box:
             (name, media, data + (table if name == SYSTEM else b""))
             for name, media, data in described.files))
         self.writer = BlackBoxWriter(self.folder, described, limits, again=again,
-                                     checkpoints=checkpoints, wall=lambda: self.now)
+                                     wall=lambda: self.now)
 
     def take(self, *message):
         self.writer.take(frame(*message))
@@ -118,19 +118,6 @@ def test_a_decision_keeps_the_time_before_and_after_it_in_a_recording(box):
     assert summary.run["rampart_version"]
     assert {"system.toml", "airport/vallombre.toml"} <= {name for name, _, _ in summary.files}
     assert summary.counts.total() > 500
-
-
-def test_the_states_of_the_nodes_at_the_beginning_are_attached(tmp_path):
-    states = tmp_path / "checkpoints"
-    states.mkdir()
-    (states / "mission_manager.1.1").write_bytes(b"light A03 is out")
-    box = Box(tmp_path, checkpoints=states)
-    box.second(0.0, decision(1, 0.5))
-    (states / "mission_manager.1.1").write_bytes(b"later")
-    box.seconds(1, 30)
-    files = {name: data for name, _, data in Summary(BagReader(box.kept[0][1])).files}
-    assert files["checkpoints/mission_manager.1.1"] == b"light A03 is out"
-    box.writer.abandon()
 
 
 def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):

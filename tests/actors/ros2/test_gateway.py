@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from rampart.actors.bus.topics import DIAGNOSTIC
-from rampart.actors.ros2.messages import GRAPH, RosGraphReport
+from rampart.actors.ros2.ros_nodes import GRAPH, RosGraphReport
 from rampart.actors.ros2.stand_in import StandIn
 from rampart.actors.ros2.translation.types import SHIPPED
 from rampart.actors.ros2.wire import Qos

@@ -13,8 +13,13 @@ import pytest
 from rampart.actors.bus.bounds import Floats32
 from rampart.actors.bus.messages import Message
 from rampart.actors.ros2.translation.forms import READY, WRITTEN
-from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
-from rampart.actors.ros2.translation.mirror import message_of, topic_of
+from rampart.actors.ros2.translation.mapping import (
+    Inward,
+    NotMeantError,
+    Outward,
+    message_of,
+    topic_of,
+)
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 

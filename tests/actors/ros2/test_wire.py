@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
+
+import msgspec
 import pytest
 
 from rampart.actors.ros2.graph import MOST, RosGraph, misfits
+from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.side import ZenohSide, recorded_key
+from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import (
     Attachment,
     Endpoint,
@@ -116,3 +123,19 @@ def test_the_graph_is_bounded_and_forgets_who_has_gone():
     with pytest.raises(ValueError, match="more than"):
         graph.changed(CAPTURED, True)
     assert graph.nodes() == {"/n": MOST}
+
+
+async def test_what_a_node_says_and_hears_is_handed_to_the_recorder_as_it_travelled():
+    types, taken, twist = Types("jazzy"), [], "geometry_msgs/msg/Twist"
+    side = ZenohSide([], asyncio.get_running_loop(), mode="peer")
+    node = RosNode(side, types, "rampart", wall_ns=time.time_ns, refuse=lambda *_: None,
+                   record=lambda *what: taken.append(what))
+    node.subscribe("/cmd_vel", twist, Qos(), lambda *_: None)
+    say, payload = node.publisher("/cmd_vel", twist, Qos()), types.encode(twist, types.blank(twist))
+    async with asyncio.timeout(10):
+        while len(taken) == len(set(taken)):  # each message is recorded once on either way
+            say(payload)
+            await asyncio.sleep(0.02)
+    side.close()
+    key = recorded_key(data_key(0, "/cmd_vel", dds_name(twist), types.hash(twist)))
+    assert {(where, msgspec.msgpack.decode(one)[0]) for where, one in taken} == {(key, payload)}
