@@ -25,7 +25,7 @@ from rampart.cli.analyse import (
 from rampart.cli.look import doctor_verb, ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
-    inject_verbs,
+    inject_verb,
     keys_verb,
     node_verbs,
     operator_verbs,
@@ -37,7 +37,7 @@ from rampart.cli.verbs import FORMATTER, PORT
 from rampart.files import loading, streams, working_folder
 
 _MODULES = (
-    node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
+    node_verbs, topic_verbs, ros_verbs, inject_verb, operator_verbs, serving_verbs, adapt_verb,
     record_verbs, incident_verbs, keys_verb, token_verbs, check_verbs, cut_set_verbs,
     decide_verbs, tree_verb, verify_verb, doctor_verb, service_verb)
 """Each adds its verbs."""

@@ -8,9 +8,10 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from tqdm import tqdm
@@ -19,7 +20,6 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.members import application_class, load_application
 from rampart.actors.system.topics import system_topics
 from rampart.cli import application_options, systems
-from rampart.cli.analyse.campaign_tables import show_faults, show_runs
 from rampart.cli.output import (
     NoEffectError,
     UsageError,
@@ -45,13 +45,22 @@ from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
 from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import (
+    Rate,
+    Row,
+    Spread,
+    as_json,
+    table,
+    total,
+    varying_options,
+)
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
-from rampart.sim.runs.report import in_words
-from rampart.sim.runs.trial import trial_class
+from rampart.sim.runs.report import NONE, in_words, margin_text
+from rampart.sim.runs.trial import Trial, trial_class
 from rampart.sim.virtual.network import find_network
 
 _LOG_S = 60.0
@@ -59,12 +68,15 @@ _LOG_S = 60.0
 
 _SHRUNK_AT_MOST = 3
 
+_SHOWN = 60
+"""Rows, at most; the report has all."""
+
 
 def campaign(options: argparse.Namespace) -> int:
     """Do what the options ask for, and return the exit code."""
     spec = systems.load(options.system)
     if options.list:
-        return show_faults(fault_groups(spec), as_json=options.json)
+        return _show_faults(fault_groups(spec), is_json=options.json)
     if options.replay:
         return _replay(options)
     _check(options)
@@ -84,7 +96,7 @@ def campaign(options: argparse.Namespace) -> int:
                          "continues there") from None
     # With the jobs of this campaign: an earlier one may have stored a run under another row.
     runs = [Run(job, results[job.key]) for job in jobs if job.key in results]
-    show_runs(spec, runs, made, named, as_json=options.json)
+    _show_runs(spec, runs, made, named, is_json=options.json)
     try:
         page = _write_report(options, spec, directory, runs, named)
     except Exception as error:  # of disk, template or chart: the verdict stands
@@ -274,6 +286,92 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
         section=named.section(spec, runs) if named else None)
     worst = {run.job.key: run_virtually(run.job) for run in worth_showing(runs)}
     return write_campaign_report(directory, about, runs, worst)
+
+
+# -- showing -----------------------------------------------------------------------------------
+
+
+def _show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCampaign | None, *,
+               is_json: bool) -> None:
+    """Print the results.
+
+    Args:
+        spec: the system.
+        runs: all runs of the campaign.
+        made: number of runs made now.
+        named: the named campaign, if it is one.
+        is_json: print rows for scripts.
+    """
+    rows = table(runs)
+    if is_json:
+        print_json([as_json(row) | (named.expected(runs, row) if named else {})
+                    for row in rows])
+        return
+    if named:
+        named.show(spec, runs)
+    else:
+        _show_rows(spec, runs, rows)
+    say()
+    say(f"{len(runs)} runs, {made} of them made now")
+    protected = [run for run in runs if run.job.ftm and run.job.faults]
+    if protected and trial_class(spec).judges:
+        all_of_them = total(protected, "all")
+        say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
+            f"successful, {all_of_them.ineffective} without effect")
+
+
+def _show_faults(groups: Mapping[str, Sequence[str]], *, is_json: bool) -> int:
+    """Print the faults by kind; return the exit code."""
+    if is_json:
+        print_json(groups, names=True)
+        return 0
+    for kind, names in groups.items():
+        say(f"{kind} ({len(names)})")
+        for name in names:
+            say(f"  {name}")
+    return 0
+
+
+def _show_rows(spec: SystemSpec, runs: Sequence[Run], rows: Sequence[Row]) -> None:
+    options, trial = varying_options(runs), trial_class(spec)
+    shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
+                                          row.success.share if row.success.of else 2.0))
+    verdicts = ("success", "safe", "worst") if trial.judges else ("restarts",)
+    margins = ("smallest margin",) if trial.margins else ()
+    print_table(
+        ("fault", *options, "FTM", "strategy", "runs", "no effect", *verdicts, "detected after",
+         "first by", *margins),
+        [_cells(row, options, trial) for row in shown[:_SHOWN]])
+    if len(shown) > _SHOWN:
+        say(f"... and {len(shown) - _SHOWN} rows more, in the report")
+
+
+def _cells(row: Row, options: Sequence[str], trial: type[Trial]) -> tuple[Any, ...]:
+    margin = min((s.least for s in row.margins.values() if s), default=None)
+    margins = (margin_text(margin, trial.margin_unit, None),) if trial.margins else ()
+    return (row.fault, *(row.options.get(name, NONE) for name in options),
+            "yes" if row.ftm else "no", row.strategy or "-", row.runs, row.ineffective,
+            *((_share(row.success), _share(row.safe), row.worst) if row.judged
+              else (row.restarts,)), _milliseconds(row.detected_after_s), _detecting(row), *margins)
+
+
+def _detecting(row: Row) -> str:
+    """Return the module that detected most often first, and those expected that stayed idle."""
+    first = next(iter(row.first_by), NONE)
+    return "; ".join([first, *(f"{name} idle: {number}" for name, number in row.idle.items())])
+
+
+def _share(found: Rate) -> str:
+    return f"{found.count}/{found.of}"
+
+
+def _rate(found: Rate) -> str:
+    return (f"{found.count} of {found.of} ({100 * found.share:.1f} %, 95 % interval "
+            f"{100 * found.low:.2f} to {100 * found.high:.2f} %)" if found.of else "none")
+
+
+def _milliseconds(found: Spread | None) -> str:
+    return "-" if found is None else f"{found.median * 1e3:.0f} ms, at most {found.most * 1e3:.0f}"
 
 
 # -- the optimiser's search for the smallest safety margin --------------------------------------

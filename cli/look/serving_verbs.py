@@ -68,6 +68,6 @@ def metrics(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
       curl -s http://127.0.0.1:9464/metrics | grep node_up
     """
     extra("prometheus", "prometheus_client.exposition")
-    from rampart.cli.look import metrics_server  # noqa: PLC0415 of the extra
+    from rampart.cli.look import live_metrics  # noqa: PLC0415 of the extra
 
-    return metrics_server.metrics(options)
+    return live_metrics.metrics(options)

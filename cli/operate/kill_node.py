@@ -5,9 +5,9 @@ Kill, stop or hang a node of a running robot.
 Examples:
   kill-node osmosis_control                  # it is restarted
   kill-node localization --signal STOP       # its heartbeat stops: it is replaced
-  kill-node --list                           # list the nodes
-In a system of several hosts it signals and lists the nodes of all hosts.
-`kill -9 PID` also works.
+  kill-node --list                           # list the processes of this machine
+In a system of several hosts it signals nodes of all hosts; `rampart node list` lists
+them. `kill -9 PID` also works.
 
 signals:
   KILL   end the process at once (default)
@@ -18,8 +18,8 @@ signals:
 STOP, CONT, TERM and SEGV go to the program of a node that has a `command`, and
 to all of its process group. KILL of the node's own process ends the program too.
 """
-# A process of this host is found in /proc. The supervisors of other hosts list and signal their
-# processes, over the bus.
+# A process of this host is found in /proc. The supervisors of other hosts signal their processes,
+# over the bus.
 
 from __future__ import annotations
 
@@ -28,12 +28,9 @@ import asyncio
 import json
 import sys
 import uuid
-from typing import Any
 
 import argcomplete
 
-from rampart.actors.bus.envelope import Header
-from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.supervision.kill_node import (
@@ -44,26 +41,13 @@ from rampart.actors.supervision.kill_node import (
 )
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.cli import completion
-from rampart.cli.output import UsageError, say
+from rampart.cli.output import say
 from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_options, flag, help_of, option
 from rampart.files import streams
-from rampart.files.plain_text import one_line
 
 _TABLE_S = 2.0
 _ANSWER_S = 5.0
-
-_LISTED_S = 1.0
-"""Simulated seconds to wait for the tables of other hosts; each is published twice."""
-
-_GONE = (fm.NodeState.CRASHED, fm.NodeState.GIVEN_UP, fm.NodeState.UNREACHABLE)
-"""States of a node without a process."""
-
-_PATIENCE_S = 3.0
-"""Real seconds to wait for the bus."""
-
-Row = dict[str, Any]
-"""A process: `name`, `pid`, `incarnation`, `port`, and `host` in a system of several."""
 
 
 async def signal_anywhere(node: str, name: str, port: int | None) -> RunProcess | fm.ProcessEvent:
@@ -103,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
                help="name of the node, for example osmosis_control"),
         option("--signal", default="KILL", type=str.upper, metavar="SIG",
                help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE"),
-        PORT, flag("--list", "list the nodes of all runs"), JSON))
+        PORT, flag("--list", "list the processes of all runs of this machine"), JSON))
     return parser
 
 
@@ -122,25 +106,13 @@ def _signal_node(options: argparse.Namespace) -> None:
 
 
 def _list_nodes(options: argparse.Namespace) -> None:
-    """Print the processes of this machine, by its kernel, and those of other hosts."""
-    runs = {run.base_port: run for run in find_runs()
-            if run.hosts and options.port in {None, run.base_port}}
-    rows: list[Row] = [
-        {"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port,
-         **({"host": runs[p.port].own_host} if p.port in runs else {})}
-        for p in find_processes(options.port) for name in p.names]
-    for run in runs.values():
-        others, missing = asyncio.run(_other_hosts(run))
-        rows += others
-        if missing:
-            print(f"kill-node: {one_line(missing)}", file=sys.stderr)
+    rows = [{"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
+            for p in find_processes(options.port) for name in p.names]
     if options.json:
         print(json.dumps(rows))
         return
-    width = max((len(row.get("host", "")) for row in rows), default=0)
     for row in rows:
-        where = f"{row.get('host', ''):<{width}} " if width else ""
-        say("{port:>6} {pid:>8} #{incarnation:<4} {where}{name}".format(where=where, **row))
+        say("{port:>6} {pid:>8} #{incarnation:<4} {name}".format(**row))
 
 
 async def _signal(node: str, name: str, port: int | None) -> fm.ProcessEvent | None:
@@ -165,36 +137,6 @@ async def _signal(node: str, name: str, port: int | None) -> fm.ProcessEvent | N
     if answer.event != "signalled":
         raise SignalError(f"{node}: {answer.detail}")
     return answer
-
-
-async def _other_hosts(run: RunInfo) -> tuple[list[Row], str]:
-    """Return the processes that other supervisors publish, and which hosts are missing and why."""
-    others = {supervisor: host for host, supervisor in run.hosts.items() if host != run.own_host}
-    tables: dict[str, fm.NodeTable] = {}
-    complete, why = asyncio.Event(), "no message arrived"
-
-    def heard(_key: str, header: Header, table: fm.NodeTable) -> None:
-        if header.source in others:
-            tables[others[header.source]] = table
-        if len(tables) == len(others):
-            complete.set()
-
-    try:
-        async with asyncio.timeout(_PATIENCE_S + _LISTED_S / run.rate):
-            async with connect(run.base_port) as session:
-                session.listen(topics.HOST_NODES, heard)
-                async with asyncio.timeout(session.real_s(_LISTED_S)):
-                    await complete.wait()
-    except UsageError as error:
-        why = str(error)
-    except TimeoutError:
-        pass
-    rows = [{"host": host, "name": row.name, "pid": row.pid, "incarnation": row.incarnation,
-             "port": run.base_port}
-            for host, table in tables.items() for row in table.nodes
-            if row.pid and row.state not in _GONE]
-    missing = " and ".join(host for host in others.values() if host not in tables)
-    return rows, f"the processes of {missing} are missing: {why}" if missing else ""
 
 
 if __name__ == "__main__":

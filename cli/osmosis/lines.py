@@ -56,7 +56,7 @@ class OsmosisLines(RobotLines):
         """Yield mission, Safety Pilot and safety for Prometheus."""
         from prometheus_client.core import StateSetMetricFamily  # noqa: PLC0415 of the extra
 
-        from rampart.cli.look.metrics_families import counter, gauge  # noqa: PLC0415 of the extra
+        from rampart.cli.look.live_metrics import counter, gauge  # noqa: PLC0415 of the extra
 
         status: m.MissionStatus | None = latest(topics.MISSION_STATUS)
         pilot: m.PilotStatus | None = latest(topics.PILOT_STATUS)

@@ -371,10 +371,10 @@ async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(r
 
 
 async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(run, monkeypatch):
-    monkeypatch.setattr("rampart.cli.operate.inject_verbs.flaw", lambda *_: "")
+    monkeypatch.setattr("rampart.cli.operate.inject_verb.flaw", lambda *_: "")
     err = await run.err(
-        1, "inject", "corrupt:localization/pose", "--noise", "x_m=-1", "--duration", "1")
-    assert "no effect: refused by simulator: noise_fields 'x_m' = -1" in err
+        1, "inject", "restamp:localization/pose", "--stamp", "0", "--duration", "1")
+    assert "no effect: refused by simulator: stamp_s = 0" in err
 
 
 async def test_reset_releases_a_latched_recovery_once(run):

@@ -35,7 +35,7 @@ from rampart.actors.system.layout import Layout, load_run
 from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
 from rampart.cli.look import top
-from rampart.cli.look.metrics_families import Exposition, families
+from rampart.cli.look.live_metrics import Exposition, families
 from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture

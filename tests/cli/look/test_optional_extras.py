@@ -22,9 +22,9 @@ from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.web.server import WebServer
 from rampart.cli import following
-from rampart.cli.look import metrics_server
+from rampart.cli.look import live_metrics
 from rampart.cli.look.live_foxglove import _watch
-from rampart.cli.look.metrics_families import Exposition, families
+from rampart.cli.look.live_metrics import Exposition, families
 from rampart.cli.run_picture import RunPicture
 from tests import ROOT
 from tests.cli.look.test_top import busy
@@ -123,12 +123,12 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
             looks.append(table)
             return {"nodes": {}, "guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
 
-    monkeypatch.setattr(metrics_server, "sessions", one)
+    monkeypatch.setattr(live_metrics, "sessions", one)
     monkeypatch.setattr(following, "ProcessObserver", Observer)
-    monkeypatch.setattr(metrics_server, "LOOK_S", 0.001)
+    monkeypatch.setattr(live_metrics, "LOOK_S", 0.001)
     monkeypatch.setattr(following, "draw", lambda _session, picture: picture.heard(
         ftm_topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
-    exporter, stop = metrics_server.Exporter(), asyncio.Event()
+    exporter, stop = live_metrics.Exporter(), asyncio.Event()
     task = asyncio.create_task(exporter.follow(None, stop))
     await asyncio.sleep(0.2)
     seen = len(looks)
@@ -140,9 +140,9 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
 
 
 async def test_prometheus_is_answered_without_a_run():
-    listening = metrics_server.listen("127.0.0.1", 0)
+    listening = live_metrics.listen("127.0.0.1", 0)
     port = listening.getsockname()[1]
-    server = WebServer(metrics_server._app(metrics_server.Exporter()), listening)
+    server = WebServer(live_metrics._app(live_metrics.Exporter()), listening)
     server.start()
     async with httpx.AsyncClient() as client:
         answer = await client.get(f"http://127.0.0.1:{port}/metrics")

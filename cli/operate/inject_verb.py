@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import contextlib
 import math
 import uuid
 from collections.abc import Coroutine, Sequence
@@ -12,17 +14,29 @@ import msgspec
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.messages import InjectionReport
+from rampart.actors.bus.run_info import find_run
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.runtime.corruption import field_type, is_array
-from rampart.actors.runtime.fault_watch import Order
+from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.actors.runtime.injection import MODES, flaw
+from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
-from rampart.cli.look.topic_catalogue import resolve, topics_for
-from rampart.cli.operate.injecting import hit_process, refuse_details, run_fault
+from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
+from rampart.cli.operate.kill_node import signal_anywhere
 from rampart.cli.operate.operator_verbs import trigger
-from rampart.cli.output import UsageError, positive, print_json, print_table, say
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    positive,
+    print_json,
+    print_table,
+    say,
+)
+from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault
@@ -32,10 +46,17 @@ from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_fault
 
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
-_SECONDS = "must be seconds above 0"
-_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt", "add": "corrupt",
-            "ramp": "corrupt", "noise": "corrupt"}
+_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt"}
 """Option → the mode that it details."""
+
+STOPPED_S = 5.0
+"""Simulated seconds for which `stop:NODE` stops a process by default."""
+
+_TAKE_HOLD_S = 1.5
+"""Real seconds within which a publisher answers, also during its restart."""
+
+_OF_TOPICS = ("share", "seed", "delay", "stamp", "set")
+"""Options of a fault of a topic."""
 
 
 def add(verbs: Any) -> None:
@@ -54,21 +75,13 @@ def add(verbs: Any) -> None:
         JSON,
         group("which messages",
               number("--share", "P", "probability that a message is affected (default: 1)"),
-              number("--on", "S", "with --off: in force for S, repeatedly"),
-              number("--off", "S", "with --on: then absent for S"),
               option("--seed", type=int, metavar="N", help="seed of random choices: share, "
-                     "noise, and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
+                     "and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
         group("details of MODE:TOPIC",
               number("--delay", "S", "delay: simulated seconds (default: 1.5)"),
               number("--stamp", "S", "restamp: simulated seconds that are added to each stamp "
                      "(default: random)"),
-              several("--set", "FIELD=VALUE",
-                      "corrupt: overwrite a field; repeatable, as all below"),
-              several("--add", "FIELD=BIAS",
-                      "corrupt: add BIAS to a number, or to each number of an array"),
-              several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
-              several("--noise", "FIELD=SIGMA",
-                      "corrupt: add Gaussian noise of this standard deviation")))
+              several("--set", "FIELD=VALUE", "corrupt: overwrite a field; repeatable")))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
@@ -104,14 +117,14 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     if not options.fault:
         raise UsageError("expected FAULT; `rampart inject --list` lists the faults")
     if options.fault.partition(":")[0] in PROCESS_FAULTS:
-        return hit_process(options)
+        return _hit_process(options)
     if options.fault.startswith(TRIGGER):
         return trigger(argparse.Namespace(
             port=options.port, module=options.fault.removeprefix(TRIGGER),
             duration=options.duration or _DEFAULT_DURATION_S))
     positive("--duration", options.duration, "must be seconds above 0, or inf")
     name, orders = orders_of(options)
-    return run_fault(name, orders, options)
+    return _run_fault(name, orders, options)
 
 
 def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
@@ -124,7 +137,7 @@ def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
     own = faults_of(systems.at_hand(None, options.port)).own(
         options.fault, f"{options.fault}-{unique}", options.duration)
     if own is not None:
-        refuse_details(options)
+        _refuse_details(options)
         if not isinstance(own, tuple):
             raise UsageError(f"{options.fault}: can only be injected from the start of a run: "
                              f"--fault {options.fault}@SECONDS")
@@ -143,10 +156,6 @@ def choose(options: argparse.Namespace) -> Fault:
     """
     if options.share is not None and not 0 < options.share <= 1:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
-    if (options.on is None) != (options.off is None):
-        raise UsageError("--on S and --off S: expected both or none")
-    positive("--on", options.on, _SECONDS, math.inf)
-    positive("--off", options.off, _SECONDS, math.inf)
     mode, colon, key = options.fault.partition(":")
     detailed = [name for name in _DETAILS if getattr(options, name) not in (None, [])]
     for name in detailed:
@@ -159,35 +168,28 @@ def choose(options: argparse.Namespace) -> Fault:
     else:
         fault = faults_of(systems.at_hand(None, options.port)).find(
             options.fault, options.seed or 0, known)
-    return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
+    return fault.varied(share=options.share)
 
 
 def _detailed(mode: str, name: str, known: Sequence[Topic[Any]], options: argparse.Namespace
               ) -> Fault:
     topic, key = resolve(name, known)
-    positive("--delay", options.delay, _SECONDS, math.inf)
+    positive("--delay", options.delay, "must be seconds above 0", math.inf)
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
-        add_fields=dict(_amount("--add", text, topic) for text in options.add),
-        ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
-        noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
         seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     if reason := flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type):
         raise UsageError(f"{options.fault}: {reason}")
     return Fault(f"{mode}:{disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
 
 
-def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
-    """Return field, value as text, and type of the field."""
+def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
+    """Return field and value of `--set`."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise UsageError(f"{option} {text}: expected FIELD=VALUE")
-    return name, value, field_type(topic.type, name).declared
-
-
-def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
-    name, value, kind = _split("--set", text, topic)
+        raise UsageError(f"--set {text}: expected FIELD=VALUE")
+    kind = field_type(topic.type, name).declared
     if is_array(name, kind):
         kind = float  # it fills the array
     if bare(kind) is str:
@@ -200,14 +202,6 @@ def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
         except msgspec.ValidationError as error:
             raise UsageError(f"--set {text}: {error}") from None
     return name, msgspec.to_builtins(found)
-
-
-def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
-    name, value, _ = _split(option, text, topic)
-    try:
-        return name, float(value)
-    except ValueError:
-        raise UsageError(f"{option} {text}: expected FIELD=NUMBER") from None
 
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
@@ -257,3 +251,167 @@ def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dic
             missing = [mode for mode in MODES if mode not in modes]
             rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
     return {topic.key: rows[topic.key] for topic in known if topic.key in rows}
+
+
+# -- the work -----------------------------------------------------------------------------------
+
+
+def _refuse_details(options: argparse.Namespace) -> None:
+    """Refuse the options of a fault of a topic with any other fault."""
+    for name in _OF_TOPICS:
+        if getattr(options, name) not in (None, []):
+            raise UsageError(f"--{name}: only with a fault of a topic, not with {options.fault}")
+
+
+def _refused(watch: FaultWatch) -> str:
+    return next((f"{node}: {reason}" for node, reason in watch.refused.items()), "")
+
+
+async def _run_fault(name: str, orders: Sequence[Order], options: argparse.Namespace) -> int:
+    """Inject a fault into the run, and return the exit code.
+
+    Args:
+        name: name of the fault.
+        orders: orders to the nodes that carry it out.
+        options: options of `rampart inject`.
+
+    Raises:
+        NoEffectError: the fault had no effect, or its effect is unknown.
+        UsageError: there is no run, or no such node in it.
+    """
+    watches = [FaultWatch((order,)) for order in orders]
+    async with connect(options.port) as session:
+        for watch in watches:
+            check_member(watch.orders[0].place, session.run.nodes)
+        settled = asyncio.Event()
+
+        def hear(_key: str, _header: Header, report: InjectionReport) -> None:
+            for watch in watches:
+                watch.hear(report)
+            if all(watch.is_settled for watch in watches):
+                settled.set()
+
+        session.listen(bus_topics.INJECTION_REPORT, hear)
+        try:
+            for watch in watches:
+                await _take_hold(session, watch)
+                if not options.json:
+                    order = watch.orders[0].message
+                    time = ("until its process ends" if watch.is_permanent
+                            else f"for {watch.waits_s:g} s")
+                    what = f"{order.mode} {order.topic} " if _is_of_topic(watch) else ""
+                    say(f"{name}: {what}in force at {', '.join(watch.nodes)} {time}")
+            if not options.at_once:
+                await pause(settled, session.real_s(max(w.waits_s for w in watches)) + 1.0)
+                if not settled.is_set():
+                    await _end(session, [w for w in watches if w.is_permanent])
+        except asyncio.CancelledError:
+            await _end(session, watches)
+            raise
+    if options.json:
+        _print_result(name, watches, at_once=options.at_once)
+    if not options.at_once:
+        for watch in watches:
+            _judge(watch)
+            if not options.json:
+                where = watch.orders[0].place if _is_of_topic(watch) else ", ".join(watch.nodes)
+                what = f"messages on {where} affected" if _is_of_topic(watch) else "ticks changed"
+                if watch.is_settled:
+                    say(f"{name}: affects {where}, continues" if watch.unfinished else
+                        f"{name}: over, {watch.affected} {what}")
+                else:  # a fault ends with the process that carries it out, and so does its count
+                    say(f"{name}: at least {watch.affected} {what}, until "
+                        f"{', '.join(watch.nodes)} was restarted")
+    return 0
+
+
+async def _hit_process(options: argparse.Namespace) -> int:
+    """Kill, stop or hang a process of the run: `kill:NODE`, `stop:NODE`, `wedge:NODE`.
+
+    Raises:
+        UsageError: there is no run or no such node, or an option does not go with it.
+    """
+    what, _, node = options.fault.partition(":")
+    if "@" in node or "+" in node:
+        raise UsageError(f"{options.fault}: the fault is injected now; expected --duration S "
+                         "instead of @WHEN or +S")
+    if what == "hang":
+        raise UsageError(f"{options.fault}: only from the start of a run, by --fault "
+                         f"{options.fault}; expected stop:{node} or wedge:{node}")
+    if what == "slow":
+        raise UsageError(f"{options.fault}: only in virtual time: --virtual --fault "
+                         f"{options.fault}")
+    if what != "stop" and options.duration is not None:
+        raise UsageError(f"--duration {options.duration:g}: {what} ends when the node is restarted")
+    _refuse_details(options)
+    positive("--duration", options.duration, "must be seconds above 0, or inf")
+    lasts_s = math.inf if what != "stop" else options.duration or STOPPED_S
+    if options.at_once and math.isfinite(lasts_s):
+        raise UsageError("--at-once: this verb has to continue the stopped process; omit it, or "
+                         "use --duration inf")
+    run = find_run(options.port)
+    victim = await signal_anywhere(node, what.upper(), run.base_port)
+    if not options.json:
+        say(f"{options.fault}: pid {victim.pid}, incarnation {victim.incarnation}"
+            + (f", for {lasts_s:g} s" if math.isfinite(lasts_s) else ""))
+    if math.isfinite(lasts_s):
+        try:
+            await asyncio.sleep(lasts_s / run.rate)
+        finally:
+            with contextlib.suppress(SignalError):  # it has been replaced
+                await signal_anywhere(node, "CONT", run.base_port)
+    if options.json:
+        print_json({"fault": options.fault, "effective": True, "node": node, "pid": victim.pid,
+                    "incarnation": victim.incarnation, "duration_s": lasts_s})
+    return 0
+
+
+async def _take_hold(session: Session, watch: FaultWatch) -> None:
+    order = watch.orders[0]
+    if not await session.command(order.topic, order.message, lambda: bool(watch.reports),
+                                 _TAKE_HOLD_S):
+        does = "publishes" if _is_of_topic(watch) else "obeys orders on"
+        raise NoEffectError(f"no effect: no node {does} {order.place} in this run")
+    if _refused(watch) and watch.affected == 0:
+        raise NoEffectError(f"no effect: refused by {_refused(watch)}")
+
+
+async def _end(session: Session, watches: list[FaultWatch]) -> None:
+    """End the injections by orders of the same ids with no duration."""
+    for watch in watches:
+        over = watch.orders[0].with_(duration_s=0.0)
+        await session.command(over.topic, over.message, lambda w=watch: not w.unfinished, 0.5)  # type: ignore[misc]
+
+
+def _judge(watch: FaultWatch) -> None:
+    where, order = ", ".join(watch.nodes), watch.orders[0]
+    if _refused(watch):
+        before = (f"ended early, after {watch.affected} messages" if watch.affected
+                  else "no effect")
+        raise NoEffectError(f"{before}: refused by {_refused(watch)}")
+    if not watch.is_settled and watch.affected == 0:
+        raise NoEffectError(f"effect unknown: {where} did not report the end of "
+                            f"{order.injection}, probably after a restart")
+    if watch.affected == 0:
+        raise NoEffectError(
+            f"no effect: {where} published no message on {order.place} that it changed within "
+            f"{watch.waits_s:g} s" if _is_of_topic(watch) else
+            f"no effect: {where} was not changed within {watch.waits_s:g} s")
+
+
+def _is_of_topic(watch: FaultWatch) -> bool:
+    """Whether a fault disturbs a topic; a node of the robot carries out other faults."""
+    return watch.orders[0].topic == bus_topics.INJECT
+
+
+def _print_result(name: str, watches: list[FaultWatch], *, at_once: bool) -> None:
+    """Print the result as JSON, with null as the duration of a permanent fault."""
+    print_json({
+        "fault": name,
+        "effective": None if at_once else all(w.affected > 0 for w in watches),
+        "injections": [
+            {"id": order.injection, "topic": w.orders[0].place,
+             "mode": order.mode if _is_of_topic(w) else None,
+             "nodes": list(w.nodes), "duration_s": order.duration_s,
+             "affected": w.affected, "finished": not w.unfinished, "reason": _refused(w)}
+            for w in watches for order in [w.orders[0].message]]})

@@ -1,24 +1,35 @@
-"""A picture of the run as Prometheus metric families. Pure.
+"""`rampart live metrics`: a picture of the run as Prometheus metric families, and their server.
 
 Names follow Prometheus' practice: base units, and `_total` for counters. Times are simulated
 seconds, except processor time. Messages, process events, decisions, detections and recoveries count
 from the exporter's start; the other counters are those of the run or of an incarnation. The
 function `rate()` of Prometheus handles the reset at the next run or incarnation.
+
+The server follows runs, and answers scrapes. Both happen on one event loop, so no message changes
+the picture during a scrape.
 """
 
 from __future__ import annotations
 
+import argparse
+import asyncio
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+from prometheus_client import CollectorRegistry, make_asgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 
-from rampart.actors.bus.run_info import RunInfo
+from rampart.actors.bus.run_info import RunInfo, ask
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.machine.process_usage import ProcessCount
+from rampart.actors.machine.process_usage import ProcessCount, read_count
+from rampart.actors.web.listening import listen
+from rampart.actors.web.server import WebServer
+from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
+from rampart.cli.output import between, say
 from rampart.cli.run_picture import RunPicture
-from rampart.cli.session import days_left
+from rampart.cli.session import days_left, pause
 
 Row = tuple[tuple[str, ...], float]
 """Values of the labels, and the value."""
@@ -131,3 +142,59 @@ def _traffic_and_load(now: Exposition) -> Iterator[Metric]:
         ((name,), count.cpu_s) for name, count in found])
     yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
                  ("process",), [((name,), count.memory_bytes) for name, count in found])
+
+
+async def metrics(options: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    stop = asyncio.Event()
+    between("--port", options.port, 0, 65535)
+    listening = listen(options.host, options.port)
+    exporter = Exporter()
+    registry = CollectorRegistry()
+    registry.register(exporter)
+    server = WebServer(make_asgi_app(registry), listening)
+    with stopped_by_signals(stop):
+        server.start()
+        host = f"[{options.host}]" if ":" in options.host else options.host
+        say(f"metrics at http://{host}:{listening.getsockname()[1]}/metrics")
+        try:
+            await exporter.follow(options.of, stop)
+        finally:
+            server.stop()
+    return 0
+
+
+class Exporter:
+    """Follows runs; `prometheus_client` collects its families at each scrape."""
+
+    def __init__(self) -> None:
+        self._watch: Watch | None = None
+
+    async def follow(self, port: int | None, stop: asyncio.Event) -> None:
+        """Follow one run after the other until `stop`."""
+        async with contextlib.aclosing(sessions(port, stop, follow=True, option="--run")) as found:
+            async for session in found:
+                self._watch = Watch(session)
+                while not stop.is_set() and not is_over(session.run):
+                    self._watch.look()
+                    await pause(stop, LOOK_S)
+                self._watch = None
+
+    def look(self) -> Exposition | None:
+        """Return the present exposition, None without a run."""
+        if self._watch is None:
+            return None
+        session, picture = self._watch.session, self._watch.picture
+        table = picture.latest(ftm_topics.NODES)
+        # The process numbers of a replay or another host may belong to other processes here.
+        nodes = [node for node in table.nodes if node.host == session.run.host
+                 ] if table and not session.run.replay_of else ()
+        pids = {node.name: node.pid for node in nodes} | {
+            row["name"]: row["pid"] for row in self._watch.used["guards"]}
+        return Exposition(
+            ask(session.run.base_port) or session.run, session.clock.now(), picture,
+            {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the present families."""
+        return families(self.look())
