@@ -17,12 +17,9 @@ NO_RUN = "rampart: --port 31999: no run there; runs found: "
 
 
 @pytest.mark.parametrize("arguments", [
-    "adapt --port 31999 set strategy guarded-repair",
     "adapt --port=31999 --json set strategy guarded-repair",
-    "adapt set --port 31999 strategy guarded-repair",
     "adapt set strategy guarded-repair --port 31999", "node --json --port 31999 list",
-    "topic hz no/such --port 31999", "inject kill:nobody --port 31999",
-    "bench --port 31999"])
+    "topic hz no/such --port 31999", "inject kill:nobody --port 31999"])
 def test_the_port_may_stand_anywhere_and_no_run_is_said_before_anything_else(refused, arguments):
     assert refused(*arguments.split()).startswith(NO_RUN)
 
@@ -50,20 +47,6 @@ def test_every_object_says_its_format(capsys):
             "topic", "info", "manager/status", "--system", str(CELL))):
         assert main([*arguments, "--json"]) == 0
         assert next(iter(json.loads(capsys.readouterr().out).items())) == ("format", 1)
-
-
-def test_the_list_of_faults_is_of_the_system_that_is_named(capsys):
-    assert main(["inject", "--list", "--system", str(CELL)]) == 0
-    told = capsys.readouterr().out
-    nodes = told.splitlines()[-1].partition("NODE is one of ")[2].split(", ")
-    assert {"supervisor", "camera", "valve", "D_CURTAIN", "R_HOLD"} <= set(nodes)
-    assert "simulator" not in nodes
-    assert "gps" not in told
-    assert main(["inject", "--list", "--system", "osmosis"]) == 0
-    assert "  stuck-wheel:front-left\n" in capsys.readouterr().out
-
-
-# -- a node that fails as soon as it has started --------------------------------------------------
 
 
 SYSTEM = """

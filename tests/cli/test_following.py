@@ -17,93 +17,63 @@ from rampart.cli.output import UsageError
 RUN = RunInfo(os.getpid(), 7450, 1.0, 0.0, "paper.toml", "", (), "first", 0, "AB")
 
 
-class Machine:
-    """The runs there are, as `sessions` finds and joins them."""
-
-    def __init__(self, monkeypatch) -> None:
-        self.runs: list[RunInfo] = []
-        self.left: list[str] = []
-        monkeypatch.setattr(following, "find_runs", lambda: list(self.runs))
-        monkeypatch.setattr(following, "connect", self._connect)
-        monkeypatch.setattr(following, "LOOK_S", 0.001)
-
-    @contextlib.asynccontextmanager
-    async def _connect(self, port):
-        found = [r for r in self.runs if port in {None, r.base_port}]
-        if len(found) != 1:
-            raise UsageError("no run found" if not found else "several runs, choose with --port")
-        try:
-            yield found[0]
-        finally:
-            self.left.append(found[0].run_id)
-
-
-@pytest.fixture
-def machine(monkeypatch):
-    return Machine(monkeypatch)
-
-
 def run(name: str, port: int = 7450) -> RunInfo:
     return msgspec.structs.replace(RUN, run_id=name, base_port=port)
 
 
-async def seen(machine: Machine, stop: asyncio.Event, ends: dict[str, list[RunInfo]],
-               port: int | None = None) -> list[str]:
-    """Follow; at the end of each run those in `ends` are there, and after the last we stop."""
-    names = []
-    async with contextlib.aclosing(following.sessions(port, stop, follow=True)) as found:
-        async for session in found:
+@pytest.fixture
+def runs(monkeypatch) -> list[RunInfo]:
+    """The runs of this machine, as `sessions` finds and joins them."""
+    there: list[RunInfo] = []
+
+    @contextlib.asynccontextmanager
+    async def connect(port):
+        found = [r for r in there if port in {None, r.base_port}]
+        if len(found) != 1:
+            raise UsageError("no run found" if not found else "several runs, choose with --port")
+        yield found[0]
+
+    monkeypatch.setattr(following, "find_runs", lambda: list(there))
+    monkeypatch.setattr(following, "connect", connect)
+    monkeypatch.setattr(following, "LOOK_S", 0.001)
+    return there
+
+
+async def test_a_run_is_waited_for_and_the_next_one_follows_until_the_user_has_had_enough(runs):
+    stop, names = asyncio.Event(), []
+
+    async def follow() -> None:
+        async for session in following.sessions(8000, stop, follow=True):
             names.append(session.run_id)
-            machine.runs = ends[session.run_id]
-            if not machine.runs:
-                stop.set()
-    return names
+            runs[:] = [run("other", 9000)]
 
-
-async def test_one_run_follows_the_other_and_each_is_left(machine):
-    machine.runs = [run("first")]
-    ends = {"first": [run("second", 8000)], "second": []}
-    assert await seen(machine, asyncio.Event(), ends) == ["first", "second"]
-    assert machine.left == ["first", "second"]
-
-
-async def test_a_run_that_is_not_there_yet_is_waited_for(machine):
-    waiting = asyncio.create_task(seen(machine, asyncio.Event(), {"late": []}))
-    await asyncio.sleep(0.02)
-    assert not waiting.done()
-    machine.runs = [run("late")]
-    async with asyncio.timeout(10):
-        assert await waiting == ["late"]
-
-
-async def test_with_a_port_only_runs_on_it_are_followed(machine):
-    machine.runs = [run("other", 9000), run("mine", 8000)]
-    assert await seen(machine, asyncio.Event(), {"mine": []}, port=8000) == ["mine"]
-
-
-async def test_waiting_ends_when_the_user_has_had_enough(machine):
-    stop = asyncio.Event()
-    waiting = asyncio.create_task(seen(machine, stop, {}))
-    await asyncio.sleep(0.01)
+    following_runs = asyncio.create_task(follow())
+    for name in ("first", "second"):
+        await asyncio.sleep(0.02)
+        runs.append(run(name, 8000))
+        async with asyncio.timeout(10):
+            while name not in names:
+                await asyncio.sleep(0.001)
     stop.set()
     async with asyncio.timeout(10):
-        assert await waiting == []
+        await following_runs
+    assert names == ["first", "second"]
 
 
-async def test_several_runs_are_a_choice_for_the_user_by_the_verbs_own_option(machine):
-    machine.runs = [run("one", 8000), run("other", 9000)]
-    with pytest.raises(UsageError, match="choose with --run"):
-        async for _ in following.sessions(None, asyncio.Event(), follow=True, option="--run"):
-            pass
-
-
-async def test_without_following_no_run_is_an_error_and_one_is_enough(machine):
+async def test_without_following_no_run_is_an_error_and_one_is_enough(runs):
     with pytest.raises(UsageError, match="no run found"):
         async for _ in following.sessions(None, asyncio.Event(), follow=False):
             pass
-    machine.runs = [run("first")]
+    runs.append(run("first"))
     names = [s.run_id async for s in following.sessions(None, asyncio.Event(), follow=False)]
     assert names == ["first"]
+
+
+async def test_several_runs_are_a_choice_for_the_user_by_the_verbs_own_option(runs):
+    runs += [run("one", 8000), run("other", 9000)]
+    with pytest.raises(UsageError, match="choose with --run"):
+        async for _ in following.sessions(None, asyncio.Event(), follow=True, option="--run"):
+            pass
 
 
 @pytest.mark.parametrize("nohup", [False, True])

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -175,6 +176,8 @@ async def test_status_shows_the_run_at_a_glance_and_as_json(run):
     assert "pilot     stop, STOPPED: RM2" in out
     assert "manager   safety-first, decision 1; ACTIVE FTM1; recovery RM1; latched RM1" in out
     assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
+    for name in ("FTM1", "RM1"):
+        assert f"clearing  {name} clears by operator (role drive) once its error is gone" in out
     out = await run.out("status", "--json")
     status = json.loads(out)
     assert (status["mission"]["phase"], status["pilot"]["mode"]) == ("running", "stop")
@@ -199,13 +202,6 @@ async def test_status_shows_nothing_that_the_system_has_not(run, monkeypatch):
     run.info.plan["mission"] = "AB"
     out = await run.out("status")
     assert "mission   silent" in out
-
-
-async def test_echo_prints_one_line_per_message(run):
-    out = await run.out("topic", "echo", "localization/pose", "-n", "3")
-    lines = out.splitlines()
-    assert len(lines) == 3
-    assert all("simulator#1 localization/pose {\"x_m\":1.0," in line for line in lines)
 
 
 async def test_a_viewer_is_refused_before_anything_else_is_checked(run, monkeypatch):
@@ -260,27 +256,35 @@ async def test_hz_measures_in_simulated_time(run):
     assert measured["window"] > 20
 
 
-async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
-        run, monkeypatch, tmp_path):
-    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (), "r1", 0, "porter")
+async def test_topics_of_the_robot_s_own_are_heard_counted_and_disturbed(
+        run, capsys, monkeypatch, tmp_path):
+    own = msgspec.structs.replace(run.info, system_file=str(write_porter_system(tmp_path)))
     monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: own)
-    out = await run.out("topic", "echo", "porter/axle/front", "-n", "1")
-    assert out.split()[1:] == ["simulator#1", "porter/axle/front", "[3.0]"]
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: own)
     code, out, _ = await run.call("topic", "echo", "porter/axle/*", "-n", "4")
-    assert (code, {line.split()[2] for line in out.splitlines()}) == (
-        0, {"porter/axle/front", "porter/axle/simulator"})
-    out = await run.out("topic", "hz", "porter/load", "--duration", "0.5", "--json")
-    assert json.loads(out)[0]["nominal_hz"] == 10
-    for fault in (["corrupt:porter/load"], ["drop:porter/axle/simulator"],
-                  ["corrupt:porter/load", "--set", "mass_kg=0"]):
-        out = await run.out("inject", *fault, "--duration", "1", "--json")
-        assert json.loads(out)["effective"] is True
+    assert (code, {line.split(" ", 1)[1] for line in out.splitlines()}) == (
+        0, {f"simulator#1 porter/axle/{name} [3.0]" for name in ("front", "simulator")})
+    out = await run.out("inject", "corrupt:porter/load", "--set", "mass_kg=0", "--duration", "1",
+                        "--json")
+    assert json.loads(out)["effective"] is True
+    rates_hz = (await pictured()).rates()
+    assert rates_hz[LOAD.key] == pytest.approx(rates_hz[topics.POSE.key], rel=0.3)
+    assert rates_hz[AXLE.key] == pytest.approx(2 * rates_hz[LOAD.key], rel=0.3)
+    assert capsys.readouterr().err == ""
+    spec = tmp_path / "porter.toml"
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: msgspec.structs.replace(
+        own, system_file=str(spec)))
+    spec.write_text(Path(own.system_file).read_text().replace(
+        "tests.porter_actors:", "elsewhere.porter:"))
+    picture = await pictured()
+    assert picture.rates()[topics.POSE.key] > 0
+    err, = capsys.readouterr().err.splitlines()
+    assert "elsewhere.porter" in err
+    assert err.endswith("; only topics of the engine are counted")
 
 
-async def pictured(run, monkeypatch, system) -> RunPicture:
-    """What `rampart top` and `rampart live metrics` have of a run of some system."""
-    of = msgspec.structs.replace(run.info, system_file=str(system))
-    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: of)
+async def pictured() -> RunPicture:
+    """Return what `rampart top` and `rampart live metrics` have of a run."""
     picture = RunPicture()
     async with connect() as session:
         draw(session, picture)
@@ -288,27 +292,6 @@ async def pictured(run, monkeypatch, system) -> RunPicture:
             picture.sample(session.clock.now())
             await asyncio.sleep(0.1)
     return picture
-
-
-async def test_the_robot_s_own_topics_are_counted_like_all_others(
-        run, capsys, tmp_path, monkeypatch):
-    rates_hz = (await pictured(run, monkeypatch, write_porter_system(tmp_path))).rates()
-    assert rates_hz[LOAD.key] == pytest.approx(rates_hz[topics.POSE.key], rel=0.3)
-    assert rates_hz[AXLE.key] == pytest.approx(2 * rates_hz[LOAD.key], rel=0.3)
-    assert capsys.readouterr().err == ""
-
-
-async def test_a_run_whose_actors_are_not_here_is_shown_all_the_same(
-        run, capsys, tmp_path, monkeypatch):
-    spec = write_porter_system(tmp_path)
-    spec.write_text(spec.read_text().replace("tests.porter_actors:", "elsewhere.porter:"))
-    picture = await pictured(run, monkeypatch, spec)
-    assert picture.latest(topics.POSE) is not None
-    assert picture.rates()[topics.POSE.key] > 0
-    err = capsys.readouterr().err
-    assert "elsewhere.porter" in err
-    assert err.endswith("; only topics of the engine are counted\n")
-    assert len(err.splitlines()) == 1
 
 
 async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run):
@@ -377,7 +360,12 @@ async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(run
     assert "no effect: refused by simulator: stamp_s = 0" in err
 
 
-async def test_reset_releases_a_latched_recovery_once(run):
+async def test_reset_releases_a_latched_recovery_once_or_says_why_not(run):
+    run.node.refusal = "FTM1 never clears; only a new run ends it"
+    assert "RM1 was not released: FTM1 never clears" in await run.err(1, "reset", "RM1")
+    run.node.refusal, run.node.obstinate = "", True
+    assert await run.err(1, "reset", "RM1") == "rampart: RM1 was not released; active: FTM1\n"
+    run.node.obstinate, run.node.resets = False, 0
     assert await run.out("reset", "RM1") == "RM1 released\n"
     assert run.node.resets == 1
     err = await run.err(1, "reset", "RM1")
@@ -400,24 +388,6 @@ async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(r
     assert "still holds brake" in err
 
 
-async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run):
-    run.node.obstinate = True
-    err = await run.err(1, "reset", "RM1")
-    assert err == "rampart: RM1 was not released; active: FTM1\n"
-
-
-async def test_a_refused_reset_prints_the_manager_s_reason(run):
-    run.node.refusal = "FTM1 never clears; only a new run ends it"
-    err = await run.err(1, "reset", "RM1")
-    assert err == ("rampart: RM1 was not released: FTM1 never clears; only a new run ends it\n")
-
-
-async def test_status_shows_how_each_active_mechanism_clears(run):
-    out = await run.out("status")
-    for name in ("FTM1", "RM1"):
-        assert f"clearing  {name} clears by operator (role drive) once its error is gone" in out
-
-
 async def test_obstacles_come_move_and_go(run):
     await run.out("obstacle", "add", "crate", "-1", "2.5")
     await run.out("obstacle", "add", "crate", "3", "2.5")
@@ -430,8 +400,5 @@ async def test_obstacles_come_move_and_go(run):
     assert err == "rampart: unknown obstacle 'box'; known: crate\n"
     await run.out("obstacle", "remove", "crate")
     assert run.node.obstacles == {}
-
-
-async def test_an_obstacle_that_the_world_refuses_is_reported_with_its_reason(run):
     err = await run.err(1, "obstacle", "add", "moon", "1", "2", "--radius", "9")
     assert err == "rampart: no effect: too big\n"

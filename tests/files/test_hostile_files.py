@@ -6,7 +6,6 @@ kernel speak up then. No time is asserted here.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import sqlite3
@@ -21,9 +20,7 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
-from rampart.actors.osmosis.airport import graph_format as mask
-from rampart.actors.osmosis.airport.model import AirportError
-from rampart.actors.recording.bag_reader import BagReader, Summary, repair
+from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.files import toml
@@ -71,13 +68,6 @@ AIRPORTS = {
 }
 
 
-@pytest.mark.parametrize(("text", "words"), AIRPORTS.values(), ids=AIRPORTS)
-def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text, words):
-    path = tmp_path / "field.toml"
-    path.write_text(text)
-    assert words in refusal(capsys, launch.main, "--virtual", "--airport", str(path))
-
-
 SPECS = {
     "nested": ("x = " + "[" * 100_000, "nested too deep"),
     "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
@@ -100,12 +90,11 @@ def test_a_system_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text,
     assert words in refusal(capsys, rampart, "table", "--system", str(path))
 
 
-@pytest.mark.parametrize("read", [launch.main, rampart])
-def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, capsys, read):
+def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, capsys):
     path = tmp_path / "zero.toml"
     path.symlink_to("/dev/zero")
-    arguments = ["--virtual", "--system"] if read is launch.main else ["verify", "--system"]
-    refusal(capsys, read, *arguments, str(path))
+    refusal(capsys, launch.main, "--virtual", "--system", str(path))
+    refusal(capsys, rampart, "verify", "--system", str(path))
 
 
 def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys):
@@ -174,21 +163,15 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize(("parts", "words"), FOREIGN.values(), ids=FOREIGN)
-def test_a_foreign_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, parts, words):
-    path = foreign(tmp_path, **parts)
-    assert words in refusal(capsys, launch.main, "--virtual", "--airport", path, "--mission", "A")
-
-
-def test_a_damaged_mask_is_read_or_refused_and_nothing_else_happens(tmp_path):
-    """Every byte of a small image is damaged in two ways."""
-    good = png_good()
-    for at in range(len(good)):
-        for value in (good[at] ^ 1 << at % 8, 255 - good[at]):
-            path = tmp_path / "mask.png"
-            path.write_bytes(good[:at] + bytes([value]) + good[at + 1:])
-            with contextlib.suppress(AirportError):
-                mask.allowed_area(path)
+@pytest.mark.parametrize(("made", "words"), [*AIRPORTS.values(), *FOREIGN.values()],
+                         ids=[*AIRPORTS, *FOREIGN])
+def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, made, words):
+    path, mission = tmp_path / "field.toml", ()
+    if isinstance(made, str):
+        path.write_text(made)
+    else:
+        path, mission = foreign(tmp_path, **made), ("--mission", "A")
+    assert words in refusal(capsys, launch.main, "--virtual", "--airport", str(path), *mission)
 
 
 def test_many_warnings_about_a_foreign_airport_are_cut_short(tmp_path):
@@ -204,34 +187,19 @@ def test_many_warnings_about_a_foreign_airport_are_cut_short(tmp_path):
 # -- recordings ------------------------------------------------------------------------------------
 
 
-def bag(path: Path, kind: CompressionType, size: int, count: int = 1, empty: int = 0) -> Path:
-    """A recording of messages of nothing but zeros, one in a chunk, then empty ones."""
+@pytest.mark.parametrize("kind", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_chunk_that_is_too_large_unpacked_is_refused(tmp_path, capsys, kind):
+    path = tmp_path / "bomb.mcap"
     with path.open("wb") as file:
         writer = Writer(file, compression=kind, chunk_size=1 << 10)
         writer.start("", "others")
-        channel = writer.register_channel("zeros", "json", 0)
-        for number in range(count):
-            writer.add_message(channel, number, bytes(size), number)
-        for number in range(empty):
-            writer.add_message(channel, number, b"", number)
+        writer.add_message(writer.register_channel("zeros", "json", 0), 0, bytes(80 << 20), 0)
         writer.finish()
-    return path
-
-
-@pytest.mark.parametrize("kind", [CompressionType.ZSTD, CompressionType.LZ4])
-def test_a_chunk_that_is_too_large_unpacked_is_refused(tmp_path, capsys, kind):
-    path = bag(tmp_path / "bomb.mcap", kind, 80 << 20)
     assert path.stat().st_size < 500_000
     for verb in (("bag", "info", str(path)), ("bag", "repair", str(path), str(tmp_path / "out")),
                  ("replay", str(path))):
         assert "bytes uncompressed; at most 67108864" in refusal(capsys, rampart, *verb)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_recording_that_is_dense_but_honest_is_read(tmp_path):
-    path = bag(tmp_path / "dense.mcap", CompressionType.ZSTD, 4 << 20, count=3, empty=1000)
-    assert Summary(BagReader(path)).messages == 1003
-    assert repair(BagReader(path), tmp_path / "copy.mcap") == 1003
 
 
 def test_an_attachment_beyond_what_is_held_is_stepped_over_and_the_rest_is_read(tmp_path):
@@ -282,26 +250,17 @@ def test_an_open_psa_file_is_bounded_in_bytes_and_may_be_nested_deeply(tmp_path,
 
 
 @pytest.mark.parametrize("damage", [
-    "update runs set job = x'c1'", "update runs set result = null", "update runs set job = 5",
-    "drop table runs", "create view v as select 1", "delete from about",
-    "update about set value = x'00'",
-    f"update runs set job = x'{'91' * 5000}'", "update runs set job = zeroblob(20000000)",
-])
+    "update runs set job = x'c1'", "drop table runs", "create view v as select 1",
+    "delete from about", "update about set value = x'00'",
+    "update runs set job = zeroblob(20000000)"])
 def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, capsys, damage):
     from rampart.sim.campaign.job import Job
     store = Store(tmp_path)
     job = msgspec.msgpack.encode(Job(row="r"))
     store.close()
     with sqlite3.connect(tmp_path / "runs.sqlite") as database:
-        database.execute("pragma writable_schema = on")
-        if damage.endswith("about"):
-            database.execute("alter table about rename to gone")
-            damage = "create table about (name text, value text)"
         database.execute("insert into runs (key, job, result) values ('abc', ?, ?)", (job, b""))
-        try:
-            database.execute(damage)
-        except sqlite3.IntegrityError:  # of a column that must not be null
-            database.execute("update runs set result = ''")
+        database.execute(damage)
     database.close()
     refusal(capsys, rampart, "campaign", "--replay", "abc", "--out", str(tmp_path))
 
