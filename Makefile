@@ -9,8 +9,6 @@ run: setup
 
 # Without Chromium the operator's page is not tested, which the last line says.
 test: setup
-	$(BIN)/python -m ruff check .
-	$(BIN)/python -m mypy
 	$(BIN)/python -m tests.suite
 
 # Long missions on real processes that the suite has shorter relatives of; three minutes.
