@@ -29,7 +29,7 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, every
-from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
+from rampart.manager.actor import FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.detection.lane import LANE
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
@@ -257,23 +257,6 @@ async def test_a_respawned_manager_adopts_a_latched_emergency_stop(system, dies_
     system.say(ftm_topics.RESET, fm.Reset("RM1", "operator"))
     await asyncio.sleep(0.5)
     assert not system.base.engaged
-
-
-@within(whole)
-async def test_a_respawned_manager_keeps_the_stop_in_force_while_it_finds_its_way(system):
-    system.robot.silent.add("command")
-    await asyncio.sleep(1.5)
-    await system.kill("ftm_manager")
-    system.revive("ftm_manager")
-    for _ in range(40):
-        await asyncio.sleep(0.05)
-        assert system.pilot.mode is PilotMode.STOP
-    system.robot.silent.clear()
-    await asyncio.sleep(2.0)
-    assert system.pilot.mode is PilotMode.AUTO
-    numbers = [d.message.decision for d in system.decisions]
-    assert numbers == sorted(set(numbers))
-    assert numbers[-1] > DECISIONS_PER_INCARNATION
 
 
 @within(whole)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from functools import partial
 
 import pytest
 
@@ -13,8 +14,6 @@ from rampart.actors.runtime.actor import Actor, every
 from rampart.testing import (
     VirtualSystem,
     eventually,
-    free_base_port,
-    free_port,
     play,
     run,
     wait_until,
@@ -31,33 +30,23 @@ class Failing(Actor):
         raise RuntimeError("it failed")
 
 
-async def living(end=None):
+async def living(end=None, error=None):
     async with VirtualSystem() as system:
         system.start("failing", Failing)
         await asyncio.sleep(3.0)
         if end:
             await getattr(system, end)("failing")
+        if error:
+            raise error
 
 
-@pytest.mark.parametrize("end", [None, "stop"])
-def test_what_an_actor_raised_fails_the_test(end):
-    with pytest.raises(RuntimeError, match="it failed"):
-        run(lambda: living(end))
-
-
-def test_who_was_killed_has_not_failed():
-    run(lambda: living("kill"))
-
-
-def test_what_fails_in_the_test_itself_comes_first():
-    async def scenario():
-        async with VirtualSystem() as system:
-            system.start("failing", Failing)
-            await asyncio.sleep(3.0)
-            raise KeyError("the test")
-
+def test_what_an_actor_raised_fails_the_test_unless_it_was_killed_or_the_test_itself_fails():
+    for end in (None, "stop"):
+        with pytest.raises(RuntimeError, match="it failed"):
+            run(partial(living, end))
+    run(partial(living, "kill"))
     with pytest.raises(KeyError, match="the test"):
-        run(scenario)
+        run(partial(living, error=KeyError("the test")))
 
 
 def test_one_hears_what_nodes_say_and_forgeries_are_rejected():
@@ -112,8 +101,3 @@ def test_a_monitor_that_is_due_for_ever_or_gives_no_reason_is_found_out():
     odd.due_s = 0.5
     with pytest.raises(AssertionError, match=r"due again at 0\.5 s"):
         wake(odd, 1.0)
-
-
-def test_free_numbers_are_free_and_differ():
-    assert len({free_base_port() for _ in range(5)}) == 5
-    assert 0 < free_port() < 65536

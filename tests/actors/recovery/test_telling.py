@@ -77,7 +77,7 @@ async def test_a_message_is_held_for_as_long_as_the_recovery_is_in_force(given):
     assert case.phase == "idle"
 
 
-@pytest.mark.parametrize("idle_s", [0.0, 0.3, 0.41, 0.5, 1.3])
+@pytest.mark.parametrize("idle_s", [0.0, 0.41])
 @within(partial(played, Hold, **SHUT, repeat_s=0.1, back={"shut": False},
                 confirm="tank/valve:shut", equals=True))
 async def test_what_is_confirmed_is_repeated_nevertheless_however_long_it_was_idle(given, idle_s):
@@ -229,7 +229,6 @@ async def test_a_call_that_is_not_answered_fails_and_names_the_answer(given):
 
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
     (Hold, {"message": {}}, "required field 'topic' is missing"),
-    (Hold, {"topic": "a", "message": 3}, "message = 3"),
     (Hold, {**SHUT, "confirm": "a:b"}, "equals: missing"),
     (Hold, {**SHUT, "equals": 1}, "confirm"),
     (Call, {"topic": "a", "messages": [{}]}, "required field 'answer' is missing"),
@@ -275,9 +274,6 @@ def layout(**changes: str) -> Layout:
 @pytest.mark.parametrize(("changes", "line"), [
     ({"VALUE": "tank/levle:height_m"}, "D_LEVEL: parameters.value: no actor has a topic 'tank/le"),
     ({"VALUE": "tank/level:hieght_m"}, "D_LEVEL: parameters.value: topic tank/level: hieght_m: "),
-    ({"TOPIC": "tank/orders"}, "R_SHUT: parameters.topic: no actor has a topic 'tank/orders'"),
-    ({"MESSAGE": "shut = 3"}, "R_SHUT: parameters.message: topic tank/order: Expected `bool`"),
-    ({"MESSAGE": ""}, "R_SHUT: parameters.message: topic tank/order: Object missing"),
     ({"MESSAGE": "shut = true, colour = 3"}, "R_SHUT: parameters.message: topic tank/order: Ob"),
 ])
 def test_what_a_specification_names_wrongly_is_refused_before_anything_runs(changes, line):

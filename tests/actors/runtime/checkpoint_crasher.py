@@ -1,19 +1,16 @@
 """A process that saves checkpoints until something kills it; for the crash-consistency tests.
 
-`python checkpoint_crasher.py DIRECTORY random|limits FIRST LAST STEP`: for each number it forks a
-child that saves states 1, 2, 3, … and acknowledges each on a pipe when `save` has returned. With
-`random` the parent kills the child so many microseconds after its start, or after its first
-acknowledgement; with `limits` the child may write no file beyond so many bytes, and ends at the
-first save that fails for it. Then the parent opens the folder as a successor would, and prints one
-JSON line: the number, whether the child ended early, the last state acknowledged, and the states
-found.
+`python checkpoint_crasher.py DIRECTORY LAST STEP`: for each number it forks a child that saves
+states 1, 2, 3, … and acknowledges each on a pipe when `save` has returned. The parent kills the
+child so many microseconds after its start, or after its first acknowledgement. Then it opens the
+folder as a successor would, and prints one JSON line: whether the child ended early, the last state
+acknowledged, and the states found.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import resource
 import select
 import signal
 import sys
@@ -46,15 +43,7 @@ def live(folder: Path, acknowledge: int, start: int) -> None:
     store.close()
 
 
-def child(folder: Path, acknowledge: int, mode: str, number: int, start: int) -> None:
-    if mode == "limits":
-        signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (number, number))
-    live(folder, acknowledge, start)
-
-
-def one(folder: Path, mode: str, number: int, start: int) -> dict[str, object]:
+def one(folder: Path, number: int, start: int) -> dict[str, object]:
     """Run one child until it dies, and return what it left."""
     read_end, write_end = os.pipe()
     pid = os.fork()
@@ -62,18 +51,17 @@ def one(folder: Path, mode: str, number: int, start: int) -> dict[str, object]:
         code = 1
         try:
             os.close(read_end)
-            child(folder, write_end, mode, number, start)
+            live(folder, write_end, start)
             code = 0
         finally:
             os._exit(code)
     os.close(write_end)
-    if mode == "random":
-        if number // 500 % 3:  # two in three die while they save, the others perhaps earlier
-            select.select([read_end], [], [], 10)
-        due = time.monotonic() + number / 1e6
-        while time.monotonic() < due:
-            pass
-        os.kill(pid, signal.SIGKILL)
+    if number // 500 % 3:  # two in three die while they save, the others perhaps earlier
+        select.select([read_end], [], [], 10)
+    due = time.monotonic() + number / 1e6
+    while time.monotonic() < due:
+        pass
+    os.kill(pid, signal.SIGKILL)
     acknowledged = b""
     while select.select([read_end], [], []) and (data := os.read(read_end, 65536)):
         acknowledged += data
@@ -86,19 +74,16 @@ def one(folder: Path, mode: str, number: int, start: int) -> dict[str, object]:
     others = [number_in(record.state) for record in loaded.records]
     store.save(1, 0, state(found))  # and it works
     store.close()
-    return {"number": number, "is_short": status != 0, "acknowledged": last, "found": found,
-            "kept": others}
+    return {"is_short": status != 0, "acknowledged": last, "found": found, "kept": others}
 
 
 def main() -> None:
-    directory, mode = Path(sys.argv[1]), sys.argv[2]
+    directory, last, step = Path(sys.argv[1]), *map(int, sys.argv[2:4])
     start = 1
-    for number in range(*map(int, sys.argv[3:6])):
+    for index, number in enumerate(range(0, last, step)):
         # Every death is survived by the same folder; every seventh meets an empty directory.
-        index = number // int(sys.argv[5])
-        folder = directory / f"{mode}-{index // 7}"
         start = 1 if index % 7 == 0 else start + 2 * SAVES
-        print(json.dumps(one(folder, mode, number, start)), flush=True)
+        print(json.dumps(one(directory / str(index // 7), number, start)), flush=True)
 
 
 if __name__ == "__main__":

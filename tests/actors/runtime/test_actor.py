@@ -264,18 +264,6 @@ async def test_a_newcomer_hears_nothing_twice_and_nothing_of_the_dead(make_bus):
         assert [body.x_m for body, _ in listener.heard] == [2.0, 3.0, 4.0]
 
 
-async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bus):
-    class Deaf(Listener):
-        def listens(self, topic) -> bool:
-            return topic is not topics.POSE
-
-    async with talking(make_bus, Deaf) as (deaf, talker):
-        talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
-        await eventually(lambda: bool(deaf.heard))
-        assert [message for message, _ in deaf.heard] == [fm.Reset("RM1", "you")]
-
-
 def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     """Python would let it happen in silence: a node's `_held` once stopped the node's mailbox."""
 

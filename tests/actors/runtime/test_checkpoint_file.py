@@ -338,19 +338,13 @@ def test_without_permission_what_can_be_read_is_found_and_the_rest_is_one_line()
 # -- killed in the middle ------------------------------------------------------------------------
 
 
-def crash(tmp_path: Path, mode: str, first: int, last: int, step: int) -> list[dict]:
+def test_a_process_that_is_killed_at_any_time_leaves_its_last_acknowledged_state_or_the_next(
+        tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "tests.actors.runtime.checkpoint_crasher", str(tmp_path), mode,
-         str(first), str(last), str(step)], cwd=ROOT, capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=100)
+        [sys.executable, "-m", "tests.actors.runtime.checkpoint_crasher", str(tmp_path), "30000",
+         "500"], cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
     assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-@pytest.mark.parametrize(("mode", "step"), [("limits", 150), ("random", 500)])
-def test_a_process_that_ends_in_any_write_leaves_its_last_acknowledged_state_or_the_next(
-        tmp_path, mode, step):
-    lives = crash(tmp_path, mode, 0, 60 * step, step)
+    lives = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(lives) == 60
     assert sum(life["is_short"] for life in lives) >= 50
     assert len({life["acknowledged"] for life in lives}) > 10, "always killed at the same point"

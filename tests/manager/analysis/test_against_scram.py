@@ -10,13 +10,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
 
 from rampart.manager.analysis.cut_sets import CutSets
 from rampart.manager.analysis.open_psa import read_open_psa, write_open_psa
 from rampart.manager.spec.specification import parse_specification
 from tests import system_file
-from tests.manager.analysis.test_cut_sets import trees
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
 
@@ -63,34 +61,6 @@ def test_the_inputs_of_scram_have_as_many_cut_sets_as_scram_finds(tmp_path):
             assert CutSets(tree, max_order=order).count == expected, (path, top)
             compared += 1
     assert compared >= 13
-
-
-@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
-@given(tree=trees(coherent=True))
-def test_random_trees_have_as_many_cut_sets_as_scram_finds(tmp_path, tree):
-    # An event that is an argument twice, through a gate of one input, SCRAM counts as two.
-    assume(all(len(gate.inputs) > 1 for gate in tree.gates.values()))
-    gates = "".join(
-        f'<define-gate name="{name}">{written(gate.low, gate.inputs, tree)}</define-gate>'
-        for name, gate in tree.gates.items())
-    path = tmp_path / "tree.xml"
-    events = "".join(f'<define-basic-event name="e{i}"/>' for i in range(6))
-    events += "".join(f'<define-house-event name="{name}"><constant value="{str(state).lower()}"/>'
-                      f"</define-house-event>" for name, state in tree.house.items())
-    path.write_text(f'<opsa-mef><define-fault-tree name="t">{gates}</define-fault-tree>'
-                    f"<model-data>{events}</model-data></opsa-mef>")
-    assert count(tmp_path, path)[tree.top] == CutSets(tree).count
-
-
-def written(least, names, tree) -> str:
-    """Return the formula "at least so many of these" in Open-PSA; SCRAM wants 2 inputs or more."""
-    kinds = {**dict.fromkeys(tree.gates, "gate"), **dict.fromkeys(tree.house, "house-event")}
-    parts = [f'<{kinds.get(name, "basic-event")} name="{name}"/>' for name in names]
-    if len(parts) == 1:
-        return parts[0]
-    if least in {1, len(parts)}:
-        return f"<or>{''.join(parts)}</or>" if least == 1 else f"<and>{''.join(parts)}</and>"
-    return f'<atleast min="{least}">{"".join(parts)}</atleast>'
 
 
 @pytest.mark.parametrize("system", ["paper", "osmosis", "cell"])

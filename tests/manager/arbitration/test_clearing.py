@@ -6,7 +6,6 @@ import asyncio
 import dataclasses
 import math
 
-import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -20,7 +19,7 @@ from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
 from rampart.manager.analysis.verification import verify
 from rampart.manager.arbitration.arbiter import Arbiter
-from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.arbitration.arbiter_memory import Memory, objection
 from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.clearing import clearing_in_words, reset_role
@@ -94,25 +93,6 @@ def test_a_reset_that_is_older_than_the_latch_has_no_effect(number):
     assert (answer.granted, answer.reason) == (False, "the reset is older than the latch")
     run.play(f"latched: {rm}")
     assert not run.send(ResetAsked(rm, "now", run.now))[0].activate
-
-
-@pytest.mark.parametrize("fields", [
-    {"clears": Clears.BY_OPERATOR, "clear_after_s": 5.0}, {"clears": Clears.NEVER},
-    {"clear_after_s": 5.0}], ids=["by operator", "never", "by itself"])
-def test_a_manager_that_is_started_again_knows_what_has_not_cleared(fields):
-    run = bench(**fields)
-    run.play(STOPPED)
-    memory = msgspec.json.decode(msgspec.json.encode(remember(run.state, run.arbiter)), type=Memory)
-    assert objection(memory) == ""
-    later = bench(**fields)
-    later.now = run.now
-    later.state = recall(later.arbiter, memory, run.now, 10_000)
-    later.play("wait 0.1 = RM2; active: FTM2")  # though RM2 died too, and the error is gone
-    for rm in ("RM1", "RM2", "RM3", "RM4", "RM5"):
-        later.play(f"{rm} {'done' if rm == 'RM2' else 'idle'}")
-    later.play("wait 2 = RM2; refused RM2; wait 3")
-    later.play("wait 0.1 =" if "clears" not in fields else "refused RM2 = RM2" if len(fields) == 1
-               else "reset RM2; wait 0.1 =")
 
 
 def test_a_memory_with_an_impossible_time_is_refused():

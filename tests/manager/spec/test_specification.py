@@ -52,17 +52,6 @@ def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
     assert [n.name for n in shared.processes()["desk"]] == ["hmi", "teleoperation"]
 
 
-def test_gates_can_be_and_or_at_least():
-    spec = parse_specification(edit((
-        'gate = "or"\nof = ["control_node_crash"',
-        'gate = { at_least = 2 }\nof = ["control_node_crash"'), (
-        'gate = "or"\nof = ["localization_estimation_error"',
-        'gate = "and"\nof = ["localization_estimation_error"')), FILE)
-    required = {e.name: e.required for e in spec.events}
-    assert tuple(required[name] for name in (
-        "command_not_updated", "localization_error", "erroneous_command")) == (2, 2, 1)
-
-
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
 HMI = ('name = "hmi"\nactor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"\nkind = "non-control"\n'
        'respawn = "RM4"')

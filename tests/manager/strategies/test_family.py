@@ -276,21 +276,6 @@ def test_mission_first_takes_the_deepest_barriers_that_are_in_time(question, dat
                    for o in taken)
 
 
-@pytest.mark.parametrize(("active", "late", "rule", "executed"), [
-    # deepest first: the respawn, although the stale command is there already
-    ("FTM4", "", 1, "RM3"), ("FTM2 FTM4 FTM5", "", 1, "RM3 RM4"), ("FTM6 FTM7", "", 1, "RM4"),
-    # late: one step up, whether or not that one is active; late again: to the top
-    ("FTM4", "FTM4", 2, "RM2"), ("FTM6 FTM7", "FTM7", 2, "RM5"), ("FTM6", "FTM6", 2, "RM1"),
-    ("FTM2 FTM4", "FTM2 FTM4", 2, "RM1"),
-    ("FTM2 FTM4", "FTM2", 2, "RM3"),  # a late parent waits for a child that is in time
-    # the root at once, whatever else
-    ("FTM1", "", 3, "RM1"), ("FTM1 FTM4", "FTM4", 3, "RM1"),
-])
-def test_mission_first_climbs_the_papers_tree(active, late, rule, executed):
-    decision = MissionFirst().choose(tuple(active.split()), PAPER, frozenset(late.split()))
-    assert (decision.rule, sorted(decision.recoveries)) == (rule, executed.split())
-
-
 @given(questions(), st.sampled_from(sorted(STRATEGIES)), st.data())
 def test_every_certificate_holds_and_leaves_nothing_unsaid(question, name, data):
     """Each chain is one of dominance; what was asked for is taken, or rejected with a reason."""
