@@ -6,6 +6,8 @@ Nor does a forged later incarnation mute a recovery module, or a source of comma
 from __future__ import annotations
 
 import asyncio
+from contextlib import asynccontextmanager
+from functools import partial
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -14,8 +16,9 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.testing import VirtualSystem, run
+from rampart.testing import VirtualSystem
 from tests.fuzz.handler_fuzz import system
+from tests.virtual_time import within
 
 FORGED = 999_999
 
@@ -49,19 +52,16 @@ class World:
                 if key == f"diagnostic/{self.actor.name}"]
 
 
-def during(name, script):
-    """Let an actor of the paper's system live, and a script be played to it."""
+@asynccontextmanager
+async def living(name):
+    """Let an actor of the paper's system live."""
     of = system("paper")
-
-    async def scenario():
-        async with VirtualSystem(of.run, of.layout) as living:
-            living.register = dict.fromkeys(of.layout.members, 1).get
-            world = World(living, name)
-            await asyncio.sleep(0.1)
-            await script(world)
-            await living.stop(name)
-
-    run(scenario)
+    async with VirtualSystem(of.run, of.layout) as virtual:
+        virtual.register = dict.fromkeys(of.layout.members, 1).get
+        world = World(virtual, name)
+        await asyncio.sleep(0.1)
+        yield world
+        await virtual.stop(name)
 
 
 STOP = m.PilotOrder(True, PilotMode.STOP, "test")
@@ -71,69 +71,61 @@ BRAKE, LET_GO = (m.BrakeCommand(engaged, "test") for engaged in (True, False))
 # -- the base -----------------------------------------------------------------------------------
 
 
-def test_an_unknown_holder_of_the_brake_is_obeyed_reported_shown_and_can_be_made_to_let_go():
-    async def script(world):
-        await world.tell(topics.BRAKE, BRAKE, "nobody")
-        assert world.is_braked
-        assert world.holders == ("nobody",)
-        assert ("brake", "nobody") in world.reports
-        told = len(world.sent)
-        await asyncio.sleep(0.5)
-        assert [key for key, _ in world.sent[told:]].count("holds/simulator") == 2
-        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
-        assert not world.is_braked
-        assert world.holders == ()
-        told = len(world.sent)
-        await asyncio.sleep(0.5)
-        assert "holds/simulator" not in [key for key, _ in world.sent[told:]]
-        await world.tell(topics.BRAKE, BRAKE, "nobody")
-        await world.tell(topics.BRAKE, LET_GO, "nobody")
-        assert (world.is_braked, world.holders) == (False, ())
-
-    during("simulator", script)
+@within(partial(living, "simulator"))
+async def test_an_unknown_holder_of_the_brake_is_obeyed_shown_and_can_be_made_to_let_go(world):
+    await world.tell(topics.BRAKE, BRAKE, "nobody")
+    assert world.is_braked
+    assert world.holders == ("nobody",)
+    assert ("brake", "nobody") in world.reports
+    told = len(world.sent)
+    await asyncio.sleep(0.5)
+    assert [key for key, _ in world.sent[told:]].count("holds/simulator") == 2
+    await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+    assert not world.is_braked
+    assert world.holders == ()
+    told = len(world.sent)
+    await asyncio.sleep(0.5)
+    assert "holds/simulator" not in [key for key, _ in world.sent[told:]]
+    await world.tell(topics.BRAKE, BRAKE, "nobody")
+    await world.tell(topics.BRAKE, LET_GO, "nobody")
+    assert (world.is_braked, world.holders) == (False, ())
 
 
-def test_a_recovery_module_s_brake_is_its_own_to_release_whatever_anybody_forges():
-    async def script(world):
-        await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
-        await world.tell(topics.BRAKE, BRAKE, "RM1")
-        await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
-        await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
-        assert world.is_braked
-        assert not any(key.startswith("holds") for key, _ in world.sent)
-        await world.tell(topics.BRAKE, LET_GO, "RM1")
-        assert not world.is_braked
-
-    during("simulator", script)
+@within(partial(living, "simulator"))
+async def test_a_recovery_module_s_brake_is_its_own_to_release_whatever_anybody_forges(world):
+    await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
+    await world.tell(topics.BRAKE, BRAKE, "RM1")
+    await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
+    await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
+    assert world.is_braked
+    assert not any(key.startswith("holds") for key, _ in world.sent)
+    await world.tell(topics.BRAKE, LET_GO, "RM1")
+    assert not world.is_braked
 
 
-def test_who_forges_a_later_incarnation_of_the_safety_pilot_neither_drives_nor_mutes_it():
-    async def script(world):
-        await world.tell(topics.BASE_COMMAND, m.BaseCommand(3.0, 0.0), "safety_pilot", FORGED)
-        assert world.actor._world._drive._wanted == (0.0, 0.0)
-        await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.5, 0.0), "safety_pilot")
-        assert world.actor._world._drive._wanted == (0.5, 0.0)
-        for _ in range(2):
-            await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.0, 0.0), "safety_pilot")
-        assert world.actor._world._drive._wanted == (0.0, 0.0)
-
-    during("simulator", script)
+@within(partial(living, "simulator"))
+async def test_who_forges_an_incarnation_of_the_safety_pilot_neither_drives_nor_mutes_it(world):
+    await world.tell(topics.BASE_COMMAND, m.BaseCommand(3.0, 0.0), "safety_pilot", FORGED)
+    assert world.actor._world._drive._wanted == (0.0, 0.0)
+    await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.5, 0.0), "safety_pilot")
+    assert world.actor._world._drive._wanted == (0.5, 0.0)
+    for _ in range(2):
+        await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.0, 0.0), "safety_pilot")
+    assert world.actor._world._drive._wanted == (0.0, 0.0)
 
 
 # -- the Safety Pilot ---------------------------------------------------------------------------
 
 
-def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended():
-    async def script(world):
-        await world.tell(topics.PILOT_ORDER, STOP, "nobody")
-        assert world.last("pilot/status")["mode"] == "stop"
-        assert world.holders == ("nobody",)
-        assert ("pilot order", "nobody") in world.reports
-        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
-        assert world.last("pilot/status")["mode"] == "auto"
-        assert world.holders == ()
-
-    during("safety_pilot", script)
+@within(partial(living, "safety_pilot"))
+async def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended(world):
+    await world.tell(topics.PILOT_ORDER, STOP, "nobody")
+    assert world.last("pilot/status")["mode"] == "stop"
+    assert world.holders == ("nobody",)
+    assert ("pilot order", "nobody") in world.reports
+    await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+    assert world.last("pilot/status")["mode"] == "auto"
+    assert world.holders == ()
 
 
 def test_orders_of_a_crowd_are_bounded_and_the_strictest_holds():

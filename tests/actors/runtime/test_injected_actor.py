@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import math
-from contextlib import asynccontextmanager
 
-from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.envelope import decode
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.sim.virtual.virtual_bus import VirtualBus
 from tests.osmosis_system import System
 from tests.virtual_time import within
 
@@ -37,128 +33,95 @@ class Talker(Actor):
 
 
 class Listener(Actor):
-    """Keeps the messages that it receives."""
+    """Keeps what it receives."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.poses: list[float] = []
         self.resets: list[str] = []
-        self.reports: list[bm.InjectionReport] = []
-        self.diagnostics: list[bm.Diagnostic] = []
 
     @on(topics.POSE)
-    def pose(self, message: m.Pose, header: Header) -> None:
+    def pose(self, message: m.Pose, _header: Header) -> None:
         self.poses.append(message.x_m)
 
     @on(ftm_topics.RESET)
-    def reset(self, message: fm.Reset, header: Header) -> None:
+    def reset(self, message: fm.Reset, _header: Header) -> None:
         self.resets.append(message.by)
 
-    @on(bus_topics.INJECTION_REPORT)
-    def report(self, message: bm.InjectionReport, header: Header) -> None:
-        self.reports.append(message)
 
-    @on(bus_topics.DIAGNOSTIC)
-    def diagnostic(self, message: bm.Diagnostic, header: Header) -> None:
-        self.diagnostics.append(message)
+class Scene(System):
+    """A talker, a listener, and what passes on the wire."""
+
+    async def __aenter__(self) -> Scene:
+        await super().__aenter__()
+        self.wire = self.hear(topics.POSE)
+        self.reports = self.hear(bus_topics.INJECTION_REPORT)
+        self.diagnostics = self.hear(bus_topics.DIAGNOSTIC)
+        self.talker = self.start("talker", Talker)
+        self.listener = self.start("listener", Listener)
+        await self.settle()
+        return self
 
     @property
     def told(self) -> list[tuple[int, bool, str]]:
-        return [(r.affected, r.finished, r.reason) for r in self.reports]
+        """What was affected, whether it is over, and why, of each report."""
+        return [(r.message.affected, r.message.finished, r.message.reason) for r in self.reports]
 
 
-class Tool(Actor):
-    """Orders injections."""
-
-    outputs = (bus_topics.INJECT,)
-
-
-class Scene:
-    """A talker, a listener, a tool, and what passes on the wire."""
-
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self.wire: list[bytes] = []
-        self.talker = system.start("talker", Talker)
-        self.listener = system.start("listener", Listener)
-        self.tool = system.start("tool", Tool)
-
-    async def open(self) -> None:
-        tap = VirtualBus(self.system.hub, "tap")
-        await tap.open()
-        for topic in (topics.POSE, ftm_topics.RESET):
-            tap.subscribe(topic.at(), lambda _key, payload: self.wire.append(payload))
-        await self.system.settle()
-
-    def inject(self, mode: str, duration_s: float, topic: str = "localization/pose",
-               **fields: object) -> None:
-        self.tool.publish(bus_topics.INJECT, bm.Injection("i", topic, mode, duration_s, **fields))
-
-
-@asynccontextmanager
-async def scene():
-    async with System() as system:
-        made = Scene(system)
-        await made.open()
-        yield made
-
-
-@within(scene)
+@within(Scene)
 async def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice(scene):
-    scene.inject("duplicate", 9.0)
-    scene.tool.publish(bus_topics.INJECT, bm.Injection("j", "manager/reset", "duplicate", 9.0))
+    scene.inject(topics.POSE, "duplicate", 9.0)
+    scene.inject(ftm_topics.RESET, "duplicate", 9.0, name="another")
     await asyncio.sleep(3.05)
-    assert len(scene.wire) == 2 * (30 + 3)
-    for first, second in zip(scene.wire[::2], scene.wire[1::2], strict=True):
-        assert first == second
-    sequences = [decode(topics.POSE, p)[0].sequence for p in scene.wire[::2]
-                 if b"RM1" not in p]
+    assert len(scene.wire) == 2 * 30
+    assert scene.wire[::2] == scene.wire[1::2]
+    sequences = [heard.header.sequence for heard in scene.wire[::2]]
     assert sequences == sorted(set(sequences))
     assert scene.listener.poses == [float(i) for i in range(1, 31)]
     assert scene.listener.resets == ["10", "20", "30"]
 
 
-@within(scene)
+@within(Scene)
 async def test_a_fault_for_a_while_reports_its_order_its_first_effect_and_its_end(scene):
-    scene.inject("drop", 0.95)
+    scene.inject(topics.POSE, "drop", 0.95)
     await asyncio.sleep(2.0)
-    assert scene.listener.told == [(0, False, ""), (1, False, ""), (9, True, "")]
+    assert scene.told == [(0, False, ""), (1, False, ""), (9, True, "")]
     assert scene.listener.poses == [float(i) for i in range(10, 20)]
 
 
-@within(scene)
+@within(Scene)
 async def test_a_permanent_fault_sets_no_timer_and_never_ends(scene):
     timers = len(scene.talker._timers)
-    scene.inject("drop", math.inf)
-    await scene.system.settle()
+    scene.inject(topics.POSE, "drop", math.inf)
+    await scene.settle()
     assert len(scene.talker._timers) == timers
     await asyncio.sleep(100.0)
     assert scene.talker.said > 900
     assert scene.listener.poses == []
-    assert scene.listener.told == [(0, False, ""), (1, False, "")]
+    assert scene.told == [(0, False, ""), (1, False, "")]
 
 
-@within(scene)
+@within(Scene)
 async def test_an_order_without_duration_ends_the_fault_with_its_count_once(scene):
-    scene.inject("drop", 5.0)
+    scene.inject(topics.POSE, "drop", 5.0)
     await asyncio.sleep(1.05)
-    scene.inject("drop", 0.0)
+    scene.inject(topics.POSE, "drop", 0.0)
     await asyncio.sleep(9.0)
     assert scene.listener.poses[0] == 11.0
-    assert [r for r in scene.listener.told if r[1]] == [(10, True, "")]
+    assert [told for told in scene.told if told[1]] == [(10, True, "")]
 
 
-@within(scene)
+@within(Scene)
 async def test_a_fault_that_does_not_fit_its_topic_is_refused_when_it_is_ordered(scene):
-    scene.inject("corrupt", 5.0, set_fields={"z_m": 1.0})
+    scene.inject(topics.POSE, "corrupt", 5.0, set_fields={"z_m": 1.0})
     await asyncio.sleep(1.05)
-    ((affected, finished, reason),) = scene.listener.told
+    ((affected, finished, reason),) = scene.told
     assert (affected, finished) == (0, True)
     assert "'z_m': unknown in Pose; known: x_m, y_m, yaw_rad" in reason
     assert len(scene.listener.poses) == 10
 
 
-@within(scene)
+@within(Scene)
 async def test_a_fault_that_fails_on_its_first_message_is_reported_as_no_effect(scene):
     class Broken(Actor):
         outputs = (topics.SCAN,)
@@ -167,11 +130,11 @@ async def test_a_fault_that_fails_on_its_first_message_is_reported_as_no_effect(
         def speak(self) -> None:
             self.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b"12345"))
 
-    scene.system.start("broken", Broken)
-    await scene.system.settle()
-    scene.inject("corrupt", 5.0, "summit_xl/scan", add_fields={"ranges_f32": 1.0})
+    scene.start("broken", Broken)
+    await scene.settle()
+    scene.inject(topics.SCAN, "corrupt", 5.0, add_fields={"ranges_f32": 1.0})
     await asyncio.sleep(9.0)
-    assert [r[:2] for r in scene.listener.told] == [(0, False), (0, True)]
-    assert "5 bytes" in scene.listener.told[-1][2]
-    (diagnostic,) = scene.listener.diagnostics
+    assert [told[:2] for told in scene.told] == [(0, False), (0, True)]
+    assert "5 bytes" in scene.told[-1][2]
+    (diagnostic,) = (heard.message for heard in scene.diagnostics)
     assert (diagnostic.context, diagnostic.offender) == ("fault injection", "summit_xl/scan")
