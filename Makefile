@@ -105,7 +105,7 @@ diagrams:
 
 # Takes the page's pictures in docs/images from a real run, with Chromium; three minutes.
 pictures: setup
-	$(BIN)/python -m tests.actors.operator.pictures
+	$(BIN)/python -m benchmarks.pictures
 
 setup: .venv/installed
 

@@ -40,8 +40,6 @@ STAMP_S = 0.5
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 """Modes that fit any topic; corruption of fields needs the catalogue."""
 
-MAX_WAITING = 16
-
 _KEPT = 20
 
 
@@ -51,20 +49,17 @@ class Ordered(FaultWatch):
 
     injection: str
     fault: str
-    begins_s: float
+    begun_s: float
     duration_s: float
     reason: str = ""
-    sent: bool = False
     ending: bool = False
     outcome: str = ""
     effective: bool | None = None
 
-    def state(self, now_s: float) -> str:
+    def state(self) -> str:
         """Return its progress in a few words."""
         if self.outcome:
             return self.outcome
-        if now_s < self.begins_s:
-            return f"begins at {self.begins_s:.0f} s"
         if not self.reports:
             return "requested"
         if self.affected:
@@ -99,34 +94,31 @@ class Injections:
                             "duration_s": f.duration_s} for f in self._catalogue.values()],
                 "modes": MODES, "topics": self._places, "duration_s": OWN_DURATION_S}
 
-    def view(self, now_s: float) -> list[dict[str, Any]]:
+    def view(self) -> list[dict[str, Any]]:
         """Return the ordered faults, newest first, for the page."""
-        return [{"injection": o.injection, "fault": o.fault, "state": o.state(now_s),
+        return [{"injection": o.injection, "fault": o.fault, "state": o.state(),
                  "ended": bool(o.outcome), "effective": o.effective}
                 for o in reversed(self._ordered)]
 
     # -- the operator ---------------------------------------------------------------------------
 
-    def order(self, fault: str, delay_s: float, duration_s: float | None, now_s: float) -> Ordered:
+    def order(self, fault: str, duration_s: float | None, now_s: float) -> Ordered:
         """Take an order of the operator.
 
         Args:
             fault: name in the catalogue, or `MODE:TOPIC`.
-            delay_s: time until it begins.
             duration_s: its duration, infinity for permanent, None for the fault's default.
             now_s: simulated seconds.
 
         Raises:
-            RefusedError: there is no such fault, or there are too many.
+            RefusedError: there is no such fault.
         """
-        if sum(not o.outcome for o in self._ordered) >= MAX_WAITING:
-            raise RefusedError(f"{MAX_WAITING} faults are active; wait for one to end")
         self._count += 1
         name = f"{self._prefix}.{self._count}"
         orders, own_s = self._find(fault, name)
         lasts_s = own_s if duration_s is None else duration_s
         ordered = Ordered([o.with_(duration_s=lasts_s) for o in orders], injection=name,
-                          fault=fault, begins_s=now_s + delay_s, duration_s=lasts_s)
+                          fault=fault, begun_s=now_s, duration_s=lasts_s)
         self._ordered.append(ordered)
         ended = [o for o in self._ordered if o.outcome]
         for old in ended[:max(0, len(self._ordered) - _KEPT)]:
@@ -141,10 +133,8 @@ class Injections:
         """
         for ordered in self._ordered:
             if ordered.injection == injection and not ordered.outcome:
-                if not ordered.sent:
-                    ordered.outcome = "withdrawn before it took hold"
                 ordered.ending = True
-                ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
+                ordered.duration_s = max(now_s - ordered.begun_s, 0.0)
                 ordered.orders = [o.with_(duration_s=0.0) for o in ordered.orders]
                 return ordered.orders
         raise RefusedError(f"no fault {injection[:60]!r} is active")
@@ -179,12 +169,10 @@ class Injections:
 
     # -- the run --------------------------------------------------------------------------------
 
-    def due(self, now_s: float) -> list[Order]:
+    def due(self) -> list[Order]:
         """Return the orders to send now: new ones and unanswered ones."""
-        begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
-        for ordered in begun:
-            ordered.sent = True
-        return [order for o in begun for order in (o.unfinished if o.ending else o.unanswered)]
+        return [order for o in self._ordered if not o.outcome
+                for order in (o.unfinished if o.ending else o.unanswered)]
 
     def take(self, report: bm.InjectionReport) -> str:
         """Take a report; return a line for the operator, "" for none."""
@@ -205,15 +193,15 @@ class Injections:
         for o in self._ordered:
             if o.outcome:
                 continue
-            if o.unanswered and now_s > o.begins_s + TAKE_HOLD_S:
+            if o.unanswered and now_s > o.begun_s + TAKE_HOLD_S:
                 where = ", ".join(x.place for x in o.unanswered)
                 o.reason = f"no publisher of {where} answers"
                 lines.append(self._conclude(o))
-            elif now_s > o.begins_s + o.duration_s + LATE_END_S:  # never true of a permanent one
+            elif now_s > o.begun_s + o.duration_s + LATE_END_S:  # never true of a permanent one
                 o.reason = "its publisher was restarted and did not report the end"
                 lines.append(self._conclude(o))
             elif (math.isinf(o.duration_s) and o.effective is None
-                  and now_s > o.begins_s + FIRST_EFFECT_S):
+                  and now_s > o.begun_s + FIRST_EFFECT_S):
                 o.effective = False
                 lines.append(f"fault {o.fault}: no effect for {FIRST_EFFECT_S:g} s; it goes on")
         return lines

@@ -1,7 +1,8 @@
 """Actions of an operator on every page: drive, choose a strategy, send signals, inject faults.
 
-`adaptation` and `injection` keep the requests that wait for an answer, and `stick` decides who
-drives. This module connects them to topics and to the page.
+`injection` keeps the faults that were ordered, and `stick` decides who drives. This module connects
+them to topics and to the page. The FTM Manager checks a changed strategy like a new system, and
+answers at once, with the reason of a refusal.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator import requests
-from rampart.actors.operator.adaptation import StrategyChoice
 from rampart.actors.operator.injection import Injections, places_of
 from rampart.actors.operator.panels import Panel
-from rampart.actors.operator.requests import RefusedError, Request
+from rampart.actors.operator.requests import Pending, RefusedError, Request
 from rampart.actors.operator.stick import Stick
 from rampart.actors.supervision.kill_node import (
     SIGNALS,
@@ -37,6 +39,9 @@ from rampart.actors.runtime.actor import Actor
 
 OVERHEAD_S = 1.0
 """Real seconds added for sockets, scheduling and restarts, which take no simulated time."""
+
+GIVE_UP_S = 5.0
+"""Simulated seconds without an answer after which the choice of a strategy is withdrawn."""
 
 OWN_DEATH_S = 0.2
 """Real seconds between the answer to a page that kills its own node, and the signal."""
@@ -61,7 +66,8 @@ class Operating:
         self._actor = actor
         self._state = state
         overhead_s = OVERHEAD_S * actor.clock.rate
-        self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
+        self._choice = Pending[fm.AdaptationRequest](
+            f"{prefix}.s", "not set: no answer from the FTM Manager", GIVE_UP_S + overhead_s)
         try:
             places = places_of(run.system)
         except ValueError:  # a replay, where the robot's own classes are not installed
@@ -92,7 +98,7 @@ class Operating:
 
     def introduction(self, page: int) -> dict[str, Any]:
         """Return the message that announces these actions to a page."""
-        return {"type": "operating", "page": page, "strategies": self._choice.strategies,
+        return {"type": "operating", "page": page, "strategies": [*STRATEGIES],
                 "signals": [*SIGNALS] if self._has_processes else [], **self._injections.choice()}
 
     def fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
@@ -106,9 +112,7 @@ class Operating:
                 case requests.StickRequest():
                     return self._stick(request.panel).move(page, request)
                 case requests.StrategyRequest():
-                    self._actor.publish(ftm_topics.ADAPT, self._choice.ask(
-                        request.name, self._strategy, self._now()))
-                    answer = f"strategy {request.name} requested"
+                    answer = self._choose(request.name)
                 case requests.SignalRequest():
                     answer = self._send_signal(request, page)
                 case requests.InjectRequest():
@@ -140,6 +144,18 @@ class Operating:
             self._state.log(self._now(), "note", f"{panel}: stick released: {why}")
         self.show()
 
+    def _choose(self, strategy: str) -> str:
+        if strategy not in STRATEGIES:
+            raise RefusedError(f"no strategy {strategy[:40]!r}; known: {', '.join(STRATEGIES)}")
+        number = self._choice.new_id()
+        if strategy == self._strategy:
+            raise RefusedError(f"strategy {strategy} is in force already")
+        value = msgspec.json.encode({"value": strategy}).decode()
+        self._actor.publish(ftm_topics.ADAPT, self._choice.put(
+            f"strategy {strategy}",
+            fm.AdaptationRequest(number, "set", "strategy", value, "operator"), self._now()))
+        return f"strategy {strategy} requested"
+
     def _send_signal(self, request: requests.SignalRequest, page: int) -> str:
         if not self._has_processes:
             raise SignalError("the nodes of this run have no processes")
@@ -165,12 +181,11 @@ class Operating:
 
     def _inject(self, request: requests.InjectRequest) -> str:
         lasts_s = math.inf if request.permanent else request.duration_s
-        ordered = self._injections.order(request.fault, request.delay_s, lasts_s, self._now())
-        self._order(self._injections.due(self._now()))
-        when = f" in {request.delay_s:g} s" if request.delay_s else ""
+        ordered = self._injections.order(request.fault, lasts_s, self._now())
+        self._order(self._injections.due())
         lasts = ("until its process ends" if math.isinf(ordered.duration_s)
                  else f"for {ordered.duration_s:g} s")
-        return f"fault {request.fault} requested{when}, {lasts}"
+        return f"fault {request.fault} requested, {lasts}"
 
     def _order(self, orders: Sequence[Order]) -> None:
         for order in orders:
@@ -186,12 +201,15 @@ class Operating:
             self._actor.publish(ftm_topics.ADAPT, self._choice.pending)
         for line in self._injections.expire(now):
             self._announce(line)
-        self._order(self._injections.due(now))
+        self._order(self._injections.due())
         self.show()
 
     def answered(self, message: fm.AdaptationAnswer) -> None:
         """Take the manager's answer to a strategy."""
-        self._announce(self._choice.answer(message))
+        if self._choice.pending is not None and message.request == self._choice.pending.request:
+            self._announce(self._choice.settle() + (
+                f" is in force, change {message.version} of the run" if message.accepted
+                else f" refused: {message.reason}"))
 
     def injected(self, message: bm.InjectionReport) -> None:
         """Take a report about a fault."""
@@ -232,7 +250,7 @@ class Operating:
         return {"sticks": {panel: self._view_stick(panel, stick, now_s)
                            for panel, stick in self._sticks.items()},
                 "strategy": self._strategy, "strategy_asked": self._choice.pending is not None,
-                "faults": self._injections.view(now_s)}
+                "faults": self._injections.view()}
 
     def show(self) -> None:
         """Update the section "operating"."""

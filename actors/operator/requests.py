@@ -15,7 +15,6 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.web.visitors import Role
 
 Name = Annotated[str, msgspec.Meta(max_length=200)]
-_Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
 _Share = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 R = TypeVar("R")
 
@@ -51,13 +50,12 @@ class SignalRequest(Request, frozen=True, tag="signal"):
 
 
 class InjectRequest(Request, frozen=True, tag="inject"):
-    """Inject a fault, after `delay_s` simulated seconds.
+    """Inject a fault.
 
     `duration_s` None is the fault's default duration; `permanent` overrides it.
     """
 
     fault: Name
-    delay_s: _Seconds = 0.0
     duration_s: Annotated[float, msgspec.Meta(gt=0, le=86_400)] | None = None
     permanent: bool = False
 

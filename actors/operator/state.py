@@ -25,7 +25,7 @@ from rampart.manager.strategies.registry import decision_in_words
 STALE_S = 1.5
 """Simulated seconds without a message after which a state is shown as stale."""
 
-_SYSTEM = Bounds(text=40_000, items=1000, room=100_000)
+_SYSTEM = Bounds(text=40_000, items=1000)
 """Bounds of the drawing of a system, with up to 300 boxes (`system`)."""
 
 TRACE_POINTS = 240

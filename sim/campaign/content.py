@@ -35,8 +35,6 @@ _FOREIGN_FOLDERS = {"reports", "__pycache__", "node_modules"}
 _FOREIGN_MARKS = {"pyvenv.cfg", FILE_NAME}
 """A folder below the robot's that contains one of these is an environment or a campaign."""
 _LEVELS = 3
-_LARGEST_BYTES = 64 << 20
-"""A larger file counts by its size and time of change."""
 _LONGEST_NAME = 400
 _DIGITS = 16
 
@@ -75,10 +73,11 @@ def content_of(job: Job) -> str:
               if path.suffix.lower() in _DATA_FILES]
     for path in sorted({path.resolve() for path in paths} | set(_sources(names))):
         try:
-            data = _bytes_of(path)
+            with path.open("rb") as opened:
+                content = hashlib.file_digest(opened, "sha256").digest()
         except OSError as error:
             raise ValueError(f"{path}: {error.strerror}; it belongs to {file}") from None
-        digest.update(f"{path.name} {len(data)}\n".encode() + data)
+        digest.update(f"{path.name}\n".encode() + content)
     return digest.hexdigest()[:_DIGITS]
 
 
@@ -116,14 +115,6 @@ def _files_below(folder: Path) -> Iterator[Path]:
                                       and below not in _FOREIGN_FOLDERS]
         yield from (here / file for file in files
                     if not file.startswith(".") and (here / file).is_file())
-
-
-def _bytes_of(path: Path) -> bytes:
-    """Return the content of a file, or of a large one its size and time of change."""
-    status = path.stat()
-    if status.st_size > _LARGEST_BYTES:
-        return f"{status.st_size} {status.st_mtime_ns}".encode()
-    return path.read_bytes()
 
 
 def _sources(modules: Iterable[str]) -> set[Path]:

@@ -23,9 +23,6 @@ create table if not exists runs (
 """
 _FORMAT = "2"
 
-MAX_VALUE_BYTES = 16 << 20
-"""Largest job or result; those of the paper's campaign have some kilobytes."""
-
 
 class StoreError(ValueError):
     """The file cannot be used; the message is one line."""
@@ -60,7 +57,6 @@ class Store:
                              ) from None
         try:
             self._database = sqlite3.connect(self.path, timeout=30.0)
-            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
             self._database.execute("pragma journal_mode = wal")
             self._database.executescript(_SCHEMA)
             self._database.execute(
@@ -68,12 +64,8 @@ class Store:
             self._database.commit()
             (found,) = self._database.execute(
                 "select value from about where name = 'format'").fetchone()
-            foreign = self._database.execute(
-                "select name from sqlite_master where type in ('view', 'trigger')").fetchone()
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise StoreError(f"{self.path}: not a store of campaign results: {error}") from None
-        if foreign is not None:  # their computations have no bound
-            raise StoreError(f"{self.path}: not a store of campaign results: has a view or trigger")
         if found != _FORMAT:
             raise StoreError(f"{self.path}: format {shown(found)}, expected {_FORMAT}; "
                              "choose another --out")

@@ -100,9 +100,7 @@ export class Operating {
   inject() {
     const chosen = $("fault").value;
     const wish = { type: "inject", fault: chosen.endsWith(":") ? chosen + $("fault-topic").value : chosen };
-    const delay = $("fault-delay").valueAsNumber;
     const duration = $("fault-duration").valueAsNumber;
-    if (Number.isFinite(delay)) wish.delay_s = delay;
     if ($("fault-permanent").checked) wish.permanent = true;
     else if (Number.isFinite(duration)) wish.duration_s = duration;
     this.send(wish);

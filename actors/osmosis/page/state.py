@@ -27,7 +27,7 @@ TRACK_STEP_M = 0.25
 
 TRACK_POINTS = 4000
 
-_ROUTE = Bounds(items=1000, room=30_000)
+_ROUTE = Bounds(items=1000)
 
 
 class OsmosisState(HmiState):

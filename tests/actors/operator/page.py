@@ -24,6 +24,11 @@ async def page(world: World, tab, airport=AIRPORT, system=SPEC, **look):
         yield hmi
 
 
+def text(name: str) -> str:
+    """Return an expression for the text of an element with an id."""
+    return f"document.getElementById('{name}').textContent"
+
+
 def events(kind: str) -> str:
     return (f"[...document.querySelectorAll('#tree .event.{kind} .ftm')]"
             ".map((t) => t.textContent).join()")

@@ -11,7 +11,7 @@ from rampart.actors.web.audit import read_audit
 from rampart.actors.web.visitors import Role, issue, revoke
 from rampart.testing import eventually, free_port
 from tests.actors.operator.test_operating import RELEASED, Hand
-from tests.actors.operator.world import TOKEN, ask, bearer, hear, open_page, served, visited
+from tests.actors.operator.world import TOKEN, ask, bearer, hear, open_page, served
 from tests.osmosis_system import shipped_system
 
 
@@ -31,18 +31,16 @@ def cookie_of(client: httpx.AsyncClient) -> dict[str, str]:
     return {"Cookie": "; ".join(f"{name}={value}" for name, value in client.cookies.items())}
 
 
-async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world):
+@pytest.mark.usefixtures("patient")
+async def test_who_logs_in_gets_a_cookie_drives_and_logs_out_and_all_others_see_only_files(world):
     async with world.hmi(hmi_token=TOKEN) as hmi:
         at = await served(hmi)
-        async with open_page(at) as page:
-            assert await turned_away(page) == "log in with your token"
-        async with open_page(at, "wrong") as page:
-            await turned_away(page)
-        async with open_page(at, TOKEN) as page:
-            assert (await hear(page, "operating"))["page"] == 1
-        async with websockets.connect(  # a token in an address or a subprotocol opens nothing
-                f"ws://{at}/ws?token={TOKEN}", subprotocols=["rampart", f"token.{TOKEN}"]) as page:
-            await turned_away(page)
+        for token, path in (("", "/ws"), ("wrong", "/ws"), ("", f"/ws?token={TOKEN}")):
+            async with open_page(at, token, path, subprotocols=["rampart", f"token.{TOKEN}"]
+                                 ) as page:
+                assert await turned_away(page) == "log in with your token"
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            await open_page(at, TOKEN, origin="http://evil.example")
         async with httpx.AsyncClient(base_url=f"http://{at}") as client:
             for path in ("/", "/app.js"):
                 assert (await client.get(path)).status_code == 200
@@ -51,16 +49,6 @@ async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world)
                 assert refused.status_code == 401
                 assert "Authorization: Bearer TOKEN" in refused.text
             assert (await client.get("/other", headers=bearer(TOKEN))).status_code == 404
-        with pytest.raises(websockets.InvalidStatus, match="403"):
-            await open_page(at, TOKEN, origin="http://evil.example")
-    assert set(world.others.stick) <= {RELEASED}
-
-
-@pytest.mark.usefixtures("patient")
-async def test_who_logs_in_gets_a_cookie_drives_and_logs_out(world):
-    async with world.hmi(hmi_token=TOKEN) as hmi:
-        at = await served(hmi)
-        async with httpx.AsyncClient(base_url=f"http://{at}") as client:
             answer = await log_in(client, TOKEN)
             assert (answer.status_code, answer.json()) == (
                 200, {"name": "operator", "role": "inject"})
@@ -69,8 +57,8 @@ async def test_who_logs_in_gets_a_cookie_drives_and_logs_out(world):
             assert "Secure" not in set_cookie  # plain HTTP: it would never be sent
             assert TOKEN not in set_cookie
             assert (await client.get("/other")).status_code == 404
-            cookie = cookie_of(client)
-            async with open_page(at, additional_headers=cookie) as page:
+            assert set(world.others.stick) <= {RELEASED}
+            async with open_page(at, additional_headers=cookie_of(client)) as page:
                 told = await hear(page, "visitor")
                 assert (told["name"], told["role"], told["barred"]) == ("operator", "inject", {})
                 await Hand(page).take()
@@ -184,7 +172,14 @@ async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
             await hear(page, "operating")
             await ask(page, type="stick", panel="Drive", held=True)
         await eventually(lambda: hmi._server.pages == 0)
-    found = read_audit(log)
+        async with open_page(at, issue(file, "carol", Role.INJECT)) as page:
+            await hear(page, "operating")
+            await ask(page, type="strategy", name="mission-first")
+            line = read_audit(log)[-1]  # written before the page is told
+    assert (line.who, line.what, line.asked, line.outcome, line.why) == (
+        "carol", "strategy", {"name": "mission-first"}, "accepted",
+        "strategy mission-first requested")
+    found = read_audit(log)[:-3]
     assert [(line.who, line.role, line.page, line.what, line.outcome) for line in found] == [
         ("anna", "drive", 0, "log in", "accepted"),
         *(("anna", "drive", 1, what, outcome) for what, outcome in (
@@ -202,15 +197,6 @@ async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
     assert {line.address for line in found} == {"127.0.0.1"}
     assert [line.t_s for line in found] == sorted(line.t_s for line in found)
     assert not [token for token in (anna, bob) if token in log.read_text()]
-
-
-async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_told(world, tmp_path):
-    log = tmp_path / "audit.jsonl"
-    async with visited(world, hmi_audit_log=str(log)) as (_, page):
-        assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
-        line = read_audit(log)[-1]
-    assert (line.what, line.asked, line.outcome, line.why) == (
-        "strategy", {"name": "mission-first"}, "accepted", "strategy mission-first requested")
 
 
 # ---- off loopback -------------------------------------------------------------------------------

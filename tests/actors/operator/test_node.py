@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 
 import httpx
 import pytest
-import websockets
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -24,15 +22,27 @@ from tests.actors.operator.world import (
     RATE,
     ask,
     hear,
-    open_page,
     repeated,
     served,
     visited,
 )
 
 
-async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
+async def test_the_mission_is_asked_for_when_the_last_node_runs_until_it_is_taken_and_never_again(
+        world):
+    async def report(state: fm.NodeState) -> None:
+        world.others.publish(ftm_topics.NODES, fm.NodeTable((
+            fm.NodeInfo("hmi", "non_control", 1, fm.NodeState.RUNNING, 1, 0),
+            fm.NodeInfo("DM1", "detection", 2, state, 1, 0))))
+        for _ in range(20):
+            await asyncio.sleep(0)
+
     async with world.hmi(mission=AIRPORT.mission("AB")):
+        await report(fm.NodeState.STARTING)
+        await asyncio.sleep(1.0 / RATE)  # two repetitions
+        assert not world.others.requests
+        await report(fm.NodeState.RUNNING)
+        assert world.others.requests
         await eventually(lambda: len(world.others.requests) >= 3)
         assert len({r.mission_id for r in world.others.requests}) == 1
         assert world.others.requests[0].goals[0] == m.Goal(-22.0, -18.5, m.Mode.TAXI)
@@ -43,32 +53,6 @@ async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world)
             "", "", m.MissionPhase.IDLE, 0, (), (), (), ""))
         await asyncio.sleep(2.0 / RATE)
         assert len(world.others.requests) == count
-
-
-async def test_the_mission_waits_for_the_last_node_and_is_sent_as_soon_as_it_runs(world):
-    async def report(state: fm.NodeState) -> None:
-        world.others.publish(ftm_topics.NODES, fm.NodeTable((
-            fm.NodeInfo("hmi", "non_control", 1, fm.NodeState.RUNNING, 1, 0),
-            fm.NodeInfo("DM1", "detection", 2, state, 1, 0))))
-        for _ in range(20):
-            await asyncio.sleep(0)
-
-    async with world.hmi(mission=AIRPORT.mission("AB")):
-        assert not world.others.requests
-        await report(fm.NodeState.STARTING)
-        await asyncio.sleep(1.0 / RATE)  # two repetitions
-        assert not world.others.requests
-        await report(fm.NodeState.RUNNING)
-        assert world.others.requests
-
-
-async def test_the_emergency_stop_is_reset_from_the_page(world, hmi, page):
-    told = await ask(page, type="reset", recovery="RM1")
-    assert "'RM1' does not wait for a reset" in told["text"]
-    world.say_latched("RM1")
-    await eventually(lambda: hmi._state.latched == ("RM1",))
-    assert (await ask(page, type="reset", recovery="RM1"))["type"] == "done"
-    await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
 
 
 async def test_a_handler_that_fails_is_told_in_one_line_and_the_page_goes_on(world, monkeypatch):
@@ -112,12 +96,10 @@ async def test_a_mission_is_started_from_the_page_unless_one_runs(world, hmi, pa
 
 async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, page):
     for text in (
-            "", "not json", "[]", "null", "{}", '{"type": "reset"}',
-            '{"type": "reset", "recovery": 1}', '{"type": "format", "disk": "c"}',
+            "", "not json", "[]", '{"type": "reset"}', '{"type": "format", "disk": "c"}',
             '{"type": "reset", "recovery": "RM1", "extra": 1}', "[" * 4000, b"\xff\xfe\x00",
             *(f'{{"type": "order"{more}}}' for more in (
-                "", ', "action": "explode"', ', "action": "PAUSE"', ', "action": ["pause"]',
-                ', "action": "pause", "by": "RM6"', ', "action": "pause", "reason": 7',
+                "", ', "action": "PAUSE"', ', "action": "pause", "by": "RM6"',
                 ', "action": "pause", "reason": "' + 201 * "x" + '"'))):
         await page.send(text)
         assert "not understood" in (await hear(page, "error"))["text"], text
@@ -164,12 +146,8 @@ async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch
             await eventually(lambda: hmi._server.pages == 0)
 
 
-async def test_a_foreign_origin_and_a_foreign_host_are_refused(hmi):
-    at = await served(hmi)
-    with pytest.raises(websockets.InvalidStatus, match="403"):
-        await open_page(at, origin="http://evil.example")
-    async with httpx.AsyncClient(base_url=f"http://{at}") as client:
-        assert (await client.get("/")).status_code == 200
+async def test_a_foreign_host_is_refused(hmi):
+    async with httpx.AsyncClient(base_url=f"http://{await served(hmi)}") as client:
         assert (await client.get("/", headers={"host": "evil.example"})).status_code == 400
         assert (await client.get("/../hmi.py")).status_code == 404
 
@@ -189,30 +167,20 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
 BUTTONS = "[...document.querySelectorAll('#orders button:enabled')].map((b) => b.dataset.order)"
 
 
-async def press(tab, key: str) -> None:
-    for kind in ("rawKeyDown", "char", "keyUp"):
-        await tab.call("Input.dispatchKeyEvent", type=kind, key=key, code="Enter",
-                       windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
-
-
 @pytest.mark.page
 async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(
         world, hmi, tab):
     p, a = m.MissionPhase, m.MissionAction
     await show(tab, hmi)
     await tab.until("document.getElementById('orders')?.hidden")
-    for phase, possible in ((p.RUNNING, (a.PAUSE, a.SKIP, a.CANCEL, a.HOME)),
-                            (p.PAUSED, (a.RESUME, a.SKIP, a.CANCEL, a.HOME)),
-                            (p.RETURNING, (a.PAUSE, a.CANCEL))):
-        async with repeated(lambda phase=phase, possible=possible: world.say(phase, *possible)):
-            shown = [x.value for x in (a.PAUSE, a.RESUME, a.SKIP, a.HOME, a.CANCEL)
-                     if x in possible]
-            await tab.until(f"JSON.stringify({BUTTONS}) === '{json.dumps(shown)}'"
-                            .replace(", ", ","))
+    async with repeated(lambda: world.say(p.PAUSED, a.RESUME, a.CANCEL)):
+        await tab.until(f"{BUTTONS}.join() === '{a.RESUME},{a.CANCEL}'")
     async with repeated(lambda: world.say(p.RUNNING, *a)):
         await tab.until(f"{BUTTONS}.length === 5")
         await tab.value("document.querySelector('[data-order=pause]').focus()")
-        await press(tab, "Enter")
+        for kind in ("rawKeyDown", "char", "keyUp"):
+            await tab.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter",
+                           windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
         # The HMI repeats an order until it is answered.
         await eventually(lambda: {o.action for o in world.others.orders} == {a.PAUSE})
         world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(

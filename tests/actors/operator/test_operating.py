@@ -11,7 +11,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator import stick_arbitration
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.supervision.kill_node import SignalError, UnknownNodeError
+from rampart.actors.supervision.kill_node import UnknownNodeError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.testing import eventually
 from tests.actors.operator.world import ask, hear, open_page, repeated, served, visited
@@ -117,12 +117,18 @@ async def test_the_page_says_whether_the_stick_has_an_effect_now(world, page):
         await operating(page, lambda o: "the brake is engaged" in o["text"])
 
 
-# ---- signals, faults ----------------------------------------------------------------------------
+# ---- signals, faults, strategies ----------------------------------------------------------------
 
 
-async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(world, monkeypatch):
+async def test_a_signal_is_sent_here_ordered_elsewhere_and_to_the_own_node_after_its_answer(
+        world, monkeypatch):
+    sent = []
+
     def signal_node(node: str, name: str, _port: int) -> RunProcess:
-        raise UnknownNodeError(f"unknown node {node!r}")
+        if node not in ("localization", "hmi"):
+            raise UnknownNodeError(f"unknown node {node!r}")
+        sent.append((node, name))
+        return RunProcess(77, 7450, 1, (node,), 1)
 
     monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
     async with visited(world, launcher_pid=1) as (_, page):
@@ -132,52 +138,43 @@ async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(w
         async with asyncio.timeout(5):
             while "teleoperation" not in str(await hear(page, "state")):
                 pass
-        told = await ask(page, type="signal", node="localization", signal="KILL")
-        assert (told["type"], world.others.signals) == ("error", [])
-        for name in ("KILL", "STOP"):
-            told = await ask(page, type="signal", node="teleoperation", signal=name)
-            assert told["type"] == "done"
+        for node, name, kind, text in (
+                ("localization", "KILL", "done", "localization (pid 77): KILL"),
+                ("localization", "HUP", "error", "unknown signal 'HUP'"),
+                ("launchd", "KILL", "error", "unknown node 'launchd'"),
+                ("teleoperation", "KILL", "done", "by the supervisor of its host"),
+                ("teleoperation", "STOP", "done", "by the supervisor of its host"),
+                ("hmi", "KILL", "done", "will reconnect")):
+            told = await ask(page, type="signal", node=node, signal=name)
+            assert told["type"] == kind
+            assert text in told["text"]
+        assert sent == [("localization", "KILL")]
+        await eventually(lambda: sent[1:] == [("hmi", "KILL")])
         await eventually(lambda: [(one.node, one.signal) for one in world.others.signals] == [
             ("teleoperation", "KILL"), ("teleoperation", "STOP")])
         first, second = world.others.signals
         assert first.order != second.order  # the same one twice would be one
 
 
-async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(
-        world, monkeypatch):
-    sent = []
-
-    def signal_node(node: str, name: str, _port: int) -> RunProcess:
-        if node not in ("localization", "hmi"):
-            raise SignalError(f"unknown node {node!r}")
-        sent.append((node, name))
-        return RunProcess(77, 7450, 1, (node,), 1)
-
-    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
-    async with visited(world, launcher_pid=1) as (_, page):
-        told = await ask(page, type="signal", node="localization", signal="KILL")
-        assert told == {"type": "done", "text": "localization (pid 77): KILL"}
-        for node, name, why in (("localization", "HUP", "unknown signal 'HUP'"),
-                                ("launchd", "KILL", "unknown node 'launchd'")):
-            told = await ask(page, type="signal", node=node, signal=name)
+async def test_what_nobody_answers_is_shown_to_have_had_no_effect(world):
+    async with visited(world, system=shipped_system()) as (hmi, page):
+        for wish, why in (({"type": "inject", "fault": "drop:world/truth"}, "no such topic"),
+                          ({"type": "signal", "node": "hmi", "signal": "KILL"}, "no processes"),
+                          ({"type": "strategy", "name": "hope"}, "no strategy 'hope'")):
+            told = await ask(page, **wish)
             assert told["type"] == "error"
             assert why in told["text"]
-        told = await ask(page, type="signal", node="hmi", signal="KILL")
-        assert "will reconnect" in told["text"]
-        assert sent == [("localization", "KILL")]
-        await eventually(lambda: sent[1:] == [("hmi", "KILL")])
-
-
-async def test_without_processes_nothing_can_be_signalled(page):
-    told = await ask(page, type="signal", node="localization", signal="KILL")
-    assert "have no processes" in told["text"]
-
-
-async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
-    async with visited(world, system=shipped_system()) as (_, page):
-        told = await ask(page, type="inject", fault="drop:world/truth")
-        assert told["type"] == "error"
         await ask(page, type="inject", fault="drop:detection/DM1")
+        await ask(page, type="strategy", name="mission-first")
+        told = await ask(page, type="strategy", name="safety-first")
+        assert told["text"] == "strategy mission-first waits for its answer"
         shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
         assert shown["faults"][0]["state"] == "no effect: no publisher of detection/DM1 answers"
         assert len({o.injection for o in world.others.injections}) == 1
+        await eventually(lambda: hmi._state.picture.value("order")["text"] == (
+            "strategy mission-first not set: no answer from the FTM Manager"))
+        assert len({a.request for a in world.others.adaptations}) == 1
+        world.others.manager()
+        await operating(page, lambda o: o["strategy"] == "guarded-repair")
+        told = await ask(page, type="strategy", name="guarded-repair")
+        assert told["text"] == "strategy guarded-repair is in force already"

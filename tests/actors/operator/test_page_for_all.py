@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from urllib.parse import urlsplit
 
 import pytest
 
 from rampart.actors.operator.hmi import Hmi
-from tests.actors.operator.page import events, page, show
+from tests.actors.operator.page import LIVE, events, page, show
 from tests.actors.operator.world import SPEC, repeated
 
 pytestmark = pytest.mark.page
-
-
-async def test_the_page_asks_nobody_but_the_hmi_for_anything(world, tab):
-    async with page(world, tab), repeated(world.others.busy):
-        await tab.until(f"{events('active')} === 'FTM4'")
-        hosts = {urlsplit(url).hostname for url in tab.requests if not url.startswith("data:")}
-        assert hosts == {"127.0.0.1"}
-        assert any(url.startswith("ws://") for url in tab.requests)
 
 
 WIDE = """[...document.querySelectorAll('main *')].filter((e) =>
@@ -109,10 +100,14 @@ async def test_everything_has_a_name_can_be_read_and_reached_and_fits_a_phone(wo
         await tab.until(busy)
         assert await tab.value("document.documentElement.scrollWidth") == 360
         assert await tab.value(WIDE) == ""
+        assert {urlsplit(url).hostname for url in tab.requests
+                if not url.startswith("data:")} == {"127.0.0.1"}, "it asks nobody but the HMI"
 
 
-async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map(world, tab):
-    async with page(world, tab):
+async def test_the_first_stop_of_the_keyboard_skips_to_the_map_and_nothing_has_to_move(world, tab):
+    async with page(world, tab, motion="reduce"):
+        assert await tab.value("parseFloat(getComputedStyle(document.querySelector("
+                               "'.event .box')).transitionDuration)") == 0
         for kind in ("rawKeyDown", "keyUp"):
             await tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
                            windowsVirtualKeyCode=9)
@@ -120,8 +115,7 @@ async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map
         outline = "getComputedStyle(document.activeElement).outlineStyle"
         assert await tab.value(outline) != "none"
         await tab.value("window.still = true; document.activeElement.click()")
-        await tab.until("location.hash === '#main'")
-        await tab.until("document.getElementById('link').textContent === 'live'")
+        await tab.until(f"location.hash === '#main' && {LIVE}")
         assert await tab.value("window.still") is True  # and the connection was kept
 
 
@@ -135,9 +129,3 @@ async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_miss
                                 ".filter((e) => e.checkVisibility()).map((e) => e.id).join()")
         assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "events-title",
                                     "order-title", "nodes-title", "fault-heading"]
-
-
-async def test_who_wants_no_motion_sees_none(world, tab):
-    moving = "getComputedStyle(document.querySelector('.event .box')).transitionDuration"
-    async with page(world, tab, motion="reduce"):
-        assert json.loads(f"[{(await tab.value(moving)).replace('s', '')}]") == [0]

@@ -12,7 +12,7 @@ from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually
 from tests.actors.operator.browser import Browser, browser
 from tests.actors.operator.page import LIVE
-from tests.actors.operator.world import SPEC, TOKEN, repeated, served
+from tests.actors.operator.world import SPEC, repeated, served
 from tests.actors.web.pems import pair
 
 pytestmark = pytest.mark.page
@@ -56,30 +56,41 @@ def encrypted(world, tmp_path):
     return shown
 
 
-async def test_one_logs_in_stays_in_over_a_reload_and_logs_out(encrypted):
-    async with encrypted(hmi_token=TOKEN) as (_, tab):
+async def test_one_logs_in_on_a_phone_stays_in_over_a_reload_until_revoked_and_logs_out(
+        encrypted, tmp_path):
+    file = tmp_path / "page.tokens"
+    who = "anna-of-the-control-room@airport.example"
+    token = issue(file, who, Role.LOOK)
+    async with encrypted(hmi_token_file=str(file)) as (hmi, tab):
+        await tab.show(f"https://{await served(hmi)}/", width=360, height=740)
         await tab.until(f"{ASKED} && {TEXT} === 'Log in with your token.'")
+        assert await tab.value("document.documentElement.scrollWidth") == 360
+        box = "document.getElementById('login').getBoundingClientRect()"
+        assert await tab.value(f"{box}.left >= 0 && {box}.right <= 360") is True
         await enter(tab, "wrong-wrong-wrong-wrong")
         await tab.until(f"{TEXT} === 'unknown token.'")
-        await enter(tab, TOKEN)
-        await tab.until(LIVE)
+        await enter(tab, token)
+        await tab.until(f"{LIVE} && document.querySelectorAll('#resets button').length === 1")
+        assert await tab.value("document.documentElement.scrollWidth") == 360
         assert await tab.value("document.cookie") == ""  # scripts do not see it
         assert await tab.value("JSON.stringify([{...localStorage}, {...sessionStorage}])"
-                               f".includes('{TOKEN}')") is False
+                               f".includes('{token}')") is False
         assert await tab.value("document.getElementById('login-token').value") == ""
-        assert await tab.value("document.getElementById('visitor').textContent") == (
-            "operator · inject")
-        assert await tab.value(notes()) == 0
-        await tab.until("document.getElementById('credentials').textContent"
-                        ".includes('days left')")  # the page's certificate expires first
+        assert await tab.value("document.getElementById('visitor').textContent") == f"{who} · look"
         await tab.value("window.before = true")
         await tab.call("Page.reload")
-        await tab.until(f"window.before === undefined && {LIVE}")
+        await tab.until(f"window.before === undefined && {LIVE}"
+                        " && document.getElementById('inject').inert")
+        revoke(file, who)
+        await tab.until(f"{ASKED} && {TEXT}.startsWith('Your token was revoked')")
+        await enter(tab, issue(file, who, Role.INJECT))
+        await tab.until(f"{LIVE} && !document.getElementById('inject').inert")
+        assert await tab.value(notes()) == 0
         await tab.value("document.getElementById('logout').click()")
         await tab.until(ASKED)
         await tab.call("Page.reload")
         await tab.until(f"document.readyState === 'complete' && {ASKED}")
-        assert [url for url in tab.requests if TOKEN in url] == []
+        assert [url for url in tab.requests if token in url] == []
         tab.errors[:] = [e for e in tab.errors if "403" not in e]  # it logs the wrong token
 
 
@@ -119,31 +130,3 @@ async def test_what_a_role_lacks_is_out_of_use_and_says_why(world, encrypted, tm
             assert not any(s.dead_man for s in world.others.stick)
             assert await tab.value("document.querySelector('.stick-state').textContent") == (
                 "not permitted")
-
-
-async def test_on_a_phone_the_form_and_who_one_is_fit_the_screen(encrypted, tmp_path):
-    file = tmp_path / "page.tokens"
-    token = issue(file, "anna-of-the-control-room@airport.example", Role.LOOK)
-    async with encrypted(hmi_token_file=str(file)) as (hmi, tab):
-        await tab.show(f"https://{await served(hmi)}/", width=360, height=740)
-        await tab.until(ASKED)
-        assert await tab.value("document.documentElement.scrollWidth") == 360
-        box = "document.getElementById('login').getBoundingClientRect()"
-        assert await tab.value(f"{box}.left >= 0 && {box}.right <= 360") is True
-        await enter(tab, token)
-        await tab.until(f"{LIVE} && document.querySelectorAll('#resets button').length === 1")
-        assert await tab.value("document.documentElement.scrollWidth") == 360
-
-
-async def test_a_withdrawn_token_brings_the_form_back_and_a_new_one_opens_again(
-        encrypted, tmp_path):
-    file = tmp_path / "page.tokens"
-    token = issue(file, "anna", Role.LOOK)
-    async with encrypted(hmi_token_file=str(file)) as (_, tab):
-        await enter(tab, token)
-        await tab.until(f"{LIVE} && document.getElementById('inject').inert")
-        revoke(file, "anna")
-        await tab.until(f"{ASKED} && {TEXT}.startsWith('Your token was revoked')")
-        await enter(tab, issue(file, "anna", Role.INJECT))
-        await tab.until(f"{LIVE} && !document.getElementById('inject').inert")
-        assert await tab.value(notes()) == 0

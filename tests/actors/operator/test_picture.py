@@ -39,19 +39,6 @@ class FakePage:
         return self.known
 
 
-def test_only_what_changed_since_a_version_is_sent():
-    picture = Picture()
-    picture.section("pose")
-    picture.section("pilot")
-    picture.put("pilot", "auto")
-    seen = picture.version
-    assert picture.changes(seen) == {}
-    picture.put("pose", 1)
-    picture.put("pilot", "auto")
-    assert as_json(picture.changes(seen)) == {"pose": 1}
-    assert as_json(picture.changes(0)) == {"pose": 1, "pilot": "auto"}
-
-
 @given(st.lists(st.one_of(
     st.tuples(st.just("put"), st.sampled_from(("pose", "pilot")), st.integers(0, 3)),
     st.tuples(st.just("log"), st.just("events"), st.integers(0, 3)),
@@ -69,6 +56,7 @@ def test_whatever_frames_a_page_missed_it_ends_up_with_the_whole_picture(steps):
         else:
             page.take(msgspec.json.encode(picture.changes(version)).decode())
             version = picture.version
+            assert picture.changes(version) == {}
     assert {"events": [], **page.known} == as_json(picture.changes(0))
 
 
@@ -200,22 +188,9 @@ async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
             await asyncio.wait_for(asyncio.shield(p.task), 5)
 
 
-async def test_a_flood_of_changes_becomes_few_frames():
-    async with Pushing() as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-        loop = asyncio.get_running_loop()
-        start, before = loop.time(), len(p.line.frames)
-        for i in range(200):
-            p.state.pose(m.Pose(float(i), 0.0, 0.0), 1.0, 1.0)
-            await asyncio.sleep(0.001)
-        most = (loop.time() - start) / hmi_feed.FRAME_GAP_S + 2
-        assert 1 < len(p.line.frames) - before <= most
-
-
 @pytest.mark.parametrize("text", [
-    b"", b'{"type":"seen"}', b'{"type":"seen","version":}', b'{"type":"seen","version":-1}',
-    b'{"type":"seen","version":1', b'{"type":"seen","version":' + 60 * b"1" + b"}", "\ud800", None,
-    b'{"type":"seen","version":1e9}', '{"type": "reset", "recovery": "RM1"}',
+    b"", b'{"type":"seen","version":-1}', b'{"type":"seen","version":' + 60 * b"1" + b"}", "\ud800",
+    None, '{"type": "reset", "recovery": "RM1"}',
 ])
 def test_what_is_no_answer_is_left_to_others(text):
     feed = Feed(OsmosisState(), lambda: 0.0, dict)

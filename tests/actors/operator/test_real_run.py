@@ -17,15 +17,12 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.web.visitors import Role, issue
 from rampart.testing import RealRun, free_base_port
 from tests.actors.operator.browser import browser
+from tests.actors.operator.page import text
 from tests.actors.operator.test_page_operating import key
 from tests.actors.web.pems import pair
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 TOKEN = "secret-of-the-hangar-7"
-
-
-def text(name: str) -> str:
-    return f"document.getElementById('{name}').textContent"
 
 
 ROW = "document.querySelector('tr[data-node=localization]')"

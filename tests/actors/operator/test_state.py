@@ -39,16 +39,3 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
         state.manager(fm.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
     assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
         (2.0, "fault", "DM2: stale"), (4.0, "clear", "DM2: clear")]
-
-
-def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_them():
-    state = OsmosisState()
-    light = m.LightMeasurement("A01", 100.0, 0.5, m.LightVerdict.OK)
-    state.mission(m.MissionStatus("1", "A", m.MissionPhase.RUNNING, 0, (), (), (light,), ""), 1.0)
-    state.light(m.LightMeasurement("A02", 0.0, 0.0, m.LightVerdict.OUT))
-    assert {k: v["verdict"] for k, v in shown(state)["lights"].items()} == {
-        "A01": "ok", "A02": "out"}
-    state.mission(m.MissionStatus("", "", m.MissionPhase.IDLE, 0, (), (), (), ""), 2.0)
-    assert set(shown(state)["lights"]) == {"A01", "A02"}
-    state.mission(m.MissionStatus("2", "A", m.MissionPhase.RUNNING, 0, (), (), (), ""), 3.0)
-    assert shown(state)["lights"] == {}

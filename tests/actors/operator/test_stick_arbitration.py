@@ -62,10 +62,17 @@ def test_who_is_followed(page, device, followed):
     assert play(page, device) == followed
 
 
-def test_who_waits_is_told_who_has_the_stick():
+def test_who_waits_or_was_lost_is_told_why_and_a_release_stops_once():
     arbiter = StickArbiter(LONG_AGO)
     arbiter.offer("page", HELD, 0.0, 0.0)
     assert arbiter.offer("device", HELD, 0.1, 0.1).told == "not followed: page has the stick"
+    lost = arbiter.expire(1.0)
+    assert (lost.released, lost.whom) == (True, "page")
+    assert "silent for 0.3 s" in lost.told
+    assert "let go first" in arbiter.offer("page", HELD, 1.1, 1.1).told
+    arbiter.offer("page", FREE, 1.2, 1.2)
+    arbiter.offer("page", HELD, 1.3, 1.3)
+    assert [arbiter.offer("page", FREE, t, t).released for t in (1.4, 1.5)] == [True, False]
 
 
 def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
@@ -81,21 +88,6 @@ def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
     assert not StickArbiter().offer("page", HELD, 1e6, 1e6).follows  # a page reports its rest
 
 
-def test_who_was_lost_is_told_so_and_told_again_when_it_comes_back_holding():
-    arbiter = StickArbiter(LONG_AGO)
-    arbiter.offer("page", HELD, 0.0, 0.0)
-    lost = arbiter.expire(1.0)
-    assert (lost.released, lost.whom) == (True, "page")
-    assert "silent for 0.3 s" in lost.told
-    assert "let go first" in arbiter.offer("page", HELD, 1.1, 1.1).told
-
-
-def test_a_release_stops_once():
-    arbiter = StickArbiter(LONG_AGO)
-    arbiter.offer("page", HELD, 0.0, 0.0)
-    assert [arbiter.offer("page", FREE, t, t).released for t in (0.1, 0.2)] == [True, False]
-
-
 @pytest.mark.parametrize("stamp_s", [-1.0, math.nan, -math.inf])
 def test_a_position_that_is_old_on_arrival_moves_nothing(stamp_s):
     arbiter = StickArbiter(LONG_AGO)
@@ -104,14 +96,10 @@ def test_a_position_that_is_old_on_arrival_moves_nothing(stamp_s):
     assert arbiter.holder == ""
 
 
-def test_a_stamp_from_the_future_holds_no_longer_than_one_from_now():
+def test_a_stamp_from_the_future_holds_no_longer_and_sources_are_not_kept_for_ever():
     arbiter = StickArbiter(LONG_AGO)
     assert arbiter.offer("page", HELD, math.inf, 0.0).follows
     assert arbiter.expire(TIMEOUT_S + 0.01).released
-
-
-def test_sources_that_come_and_go_for_ever_are_not_kept_for_ever():
-    arbiter = StickArbiter(LONG_AGO)
     for number in range(1000):
         arbiter.offer(f"tool {number}", HELD, number, number)
     assert len(arbiter._barred) <= 64

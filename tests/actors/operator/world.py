@@ -120,10 +120,10 @@ class World:
             await asyncio.wait_for(task, 5)
 
     @asynccontextmanager
-    async def hmi(self, incarnation: int = 1, **shared: object):
+    async def hmi(self, incarnation: int = 1, panels=OsmosisHmi.panels, **shared: object):
         context = replace(self.context("hmi", incarnation, **shared),
                           topics={topic.key: topic for topic in topics.ALL},
-                          parameters={"panels": OsmosisHmi.panels})
+                          parameters={"panels": panels})
         async with self.running(OsmosisHmi(context)) as hmi:
             yield hmi
 
@@ -161,9 +161,9 @@ async def served(hmi: OsmosisHmi) -> str:
     return f"127.0.0.1:{hmi._server.port}"
 
 
-def open_page(at: str, token: str = "", **options):
+def open_page(at: str, token: str = "", path: str = "/ws", **options):
     options.setdefault("additional_headers", bearer(token) if token else None)
-    return websockets.connect(f"ws://{at}/ws", **options)
+    return websockets.connect(f"ws://{at}{path}", **options)
 
 
 def bearer(token: str) -> dict[str, str]:

@@ -116,15 +116,6 @@ def test_two_files_that_swap_their_names_change_the_key(folder):
     assert digest(folder) != before
 
 
-def test_a_file_too_large_to_read_counts_by_its_size(folder):
-    digests = {digest(folder)}
-    for size in (1 << 40, 1 << 41):
-        with (folder / "tank_parts/world.mjb").open("ab") as file:
-            file.truncate(size)
-        digests.add(digest(folder))
-    assert len(digests) == 3
-
-
 def test_the_engine_is_part_of_it(folder, monkeypatch):
     before = digest(folder)
     monkeypatch.setattr(content, "version", lambda _name: "99.0")

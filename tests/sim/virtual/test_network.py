@@ -68,16 +68,3 @@ def test_the_observer_receives_messages_at_once_on_any_network():
     assert network.link("a", "observer") is None
     assert network.link("observer", "a") is None
     assert network.link("a", "b")(5.0) == ()
-
-
-@pytest.mark.parametrize(("field", "value"), [
-    ("loss", 1.5), ("duplication", -0.1), ("reordering", float("nan")), ("extra_s", -1.0)])
-def test_an_impossible_network_is_refused(field, value):
-    with pytest.raises(ValueError, match=field):
-        NetworkModel("x", "", **{field: value})
-
-
-@pytest.mark.parametrize("values", [(1.0,), (2.0, 1.0), (-1.0, 1.0)])
-def test_quantiles_that_are_none_are_refused(values):
-    with pytest.raises(ValueError, match="message_ms"):
-        Timing(values, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))

@@ -1,6 +1,6 @@
 """Takes the pictures of the operator's page that README and docs show.
 
-Run it with `python -m tests.actors.operator.pictures [DIRECTORY]`; by default they go to
+Run it with `python -m benchmarks.pictures [DIRECTORY]`; by default they go to
 docs/images. A real run of mission AB in which one wheel gets weak, so that the robot goes on at
 reduced speed, and Osmosis Control is killed. The film shows a kill of Localization before that.
 """
@@ -20,7 +20,7 @@ from tests import ROOT
 from tests.actors.operator.browser import Browser, browser
 
 PAGE_PORT = 8580
-MOST_BYTES = 250_000
+MOST_KB = 250
 LIVE = "document.getElementById('link').textContent === 'live'"
 RATE = 1.0
 FAULT_S = 76.0
@@ -31,6 +31,11 @@ BEFORE_S = 2.0
 FRAME_S = 0.4
 
 
+def size_kb(file: Path) -> float:
+    """Return the size of a file."""
+    return file.stat().st_size / 1000
+
+
 async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
     """Take a picture; one that is large gets a palette, which the many colours of a photo need."""
     await tab.until(LIVE, 60)
@@ -39,9 +44,9 @@ async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
     image = Image.open(io.BytesIO(raw.read_bytes())).convert("RGB")
     raw.unlink()
     image.save(file, optimize=True)
-    if file.stat().st_size > MOST_BYTES:
+    if size_kb(file) > MOST_KB:
         image.quantize(256, method=Image.Quantize.FASTOCTREE).save(file, optimize=True)
-    print(f"{file}: {image.size[0]} x {image.size[1]}, {file.stat().st_size / 1000:.0f} kB")
+    print(f"{file}: {image.size[0]} x {image.size[1]}, {size_kb(file):.0f} kB")
 
 
 async def film(tab: Browser, run: RealRun, victim: str, file: Path) -> None:
@@ -65,7 +70,7 @@ async def film(tab: Browser, run: RealRun, victim: str, file: Path) -> None:
     frames[0].save(file, save_all=True, append_images=frames[1:], loop=0, quality=70, method=6,
                    duration=[round(1000 * (end_s - time_s))
                              for time_s, end_s in zip(times_s, ends_s, strict=True)])
-    print(f"{file}: {len(frames)} frames, {file.stat().st_size / 1000:.0f} kB")
+    print(f"{file}: {len(frames)} frames, {size_kb(file):.0f} kB")
 
 
 async def look(tab: Browser, width: int, height: int, scheme: str) -> None:
