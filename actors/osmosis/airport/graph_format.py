@@ -16,13 +16,13 @@ and holes of a few pixels are dropped. The area outside the image is prohibited.
 from __future__ import annotations
 
 import io
-import json
 import math
 import re
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -150,6 +150,9 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MAX_TEXT_BYTES = 1 << 20
 """Size of a graph or mission file; 5,000 nodes and 10,000 edges take half of it."""
 
+Metres = Annotated[float, msgspec.Meta(ge=-model.MAX_NUMBER, le=model.MAX_NUMBER)]
+
+_EXAMPLE = '{"nodes": [{"id": "N1", "x": 0, "y": 0}], "edges": [["N1", "N2"]]}'
 _FIELD = re.compile(r"\s*(x|y|taxi)\s*=\s*(\S+)\s*")
 
 
@@ -193,6 +196,17 @@ def _reached_by(nodes: dict[str, Point], area: Any) -> Any:
     return MultiPolygon(parts) if parts else area
 
 
+class _Node(msgspec.Struct):
+    id: model.Name
+    x: Metres
+    y: Metres
+
+
+class _Graph(msgspec.Struct):
+    nodes: Annotated[list[_Node], msgspec.Meta(min_length=1)]
+    edges: list[tuple[str, str]]
+
+
 def read_graph(path: Path) -> tuple[dict[str, Point], tuple[tuple[str, str], ...]]:
     """Read nodes and edges of a `.graph` file.
 
@@ -200,31 +214,18 @@ def read_graph(path: Path) -> tuple[dict[str, Point], tuple[tuple[str, str], ...
         AirportError: not JSON, or an invalid node or edge.
     """
     try:
-        table = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting
-        raise AirportError(f"{path}: not JSON: {error}: expected a graph") from None
-    if not isinstance(table, dict) or not all(
-            isinstance(table.get(key), list) for key in ("nodes", "edges")):
-        raise AirportError(f"{path}: file: {shown(table)}: expected the lists nodes and edges")
-    nodes: dict[str, Point] = {}
-    for i, entry in enumerate(table["nodes"]):
-        name, at = _node(entry, f"{path}: nodes[{i}]")
-        if name in nodes:
-            raise AirportError(f"{path}: nodes[{i}].id: {name!r}: duplicate id")
-        nodes[name] = at
-    edges = []
-    for i, entry in enumerate(table["edges"]):
-        if not (isinstance(entry, list) and len(entry) == 2
-                and all(isinstance(end, str) for end in entry)):
-            raise AirportError(f'{path}: edges[{i}]: {shown(entry)}: expected ["N1", "N2"]')
-        for end in entry:
+        graph = msgspec.json.decode(_text(path), type=_Graph)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise AirportError(f"{path}: {error}: expected a graph, {_EXAMPLE}") from None
+    nodes = {node.id: (node.x, node.y) for node in graph.nodes}
+    for name in model.repeated(node.id for node in graph.nodes):
+        raise AirportError(f"{path}: nodes: {name!r}: duplicate id")
+    for i, edge in enumerate(graph.edges):
+        for end in edge:
             if end not in nodes:
-                raise AirportError(f"{path}: edges[{i}]: {end!r}: unknown node; expected one of "
-                                   "nodes")
-        edges.append((entry[0], entry[1]))
-    if not nodes:
-        raise AirportError(f"{path}: nodes: empty: a graph needs at least one node")
-    return nodes, tuple(edges)
+                raise AirportError(
+                    f"{path}: edges[{i}]: {end!r}: unknown node; expected one of nodes")
+    return nodes, tuple(graph.edges)
 
 
 def read_mission(path: Path) -> Mission:
@@ -254,28 +255,14 @@ def _goal(line: str, where: str) -> model.MissionGoal:
     return model.MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
 
 
-def _node(entry: Any, where: str) -> tuple[str, Point]:
-    if not (isinstance(entry, dict) and isinstance(entry.get("id"), str)):
-        raise AirportError(f'{where}: {shown(entry)}: expected {{"id": "N1", "x": 0, "y": 0}}')
-    name = entry["id"]
-    if not name.isprintable() or len(name) > model.MAX_NAME:
-        raise AirportError(f"{where}.id: {shown(name)}: expected at most "
-                           f"{model.MAX_NAME} printable characters")
-    return name, (_number(entry.get("x"), f"{where}.x"), _number(entry.get("y"), f"{where}.y"))
-
-
-def _number(value: Any, where: str) -> float:
+def _number(text: str, where: str) -> float:
     try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
+        number = float(text)
+    except ValueError:
         number = math.nan
-    if not math.isfinite(number):
-        raise AirportError(f"{where}: {shown(value)}: must be a finite number of metres")
-    if abs(number) > model.MAX_NUMBER:
-        raise AirportError(
-            f"{where}: {shown(value)}: must be within {model.MAX_NUMBER:,.0f} m of 0")
+    if not abs(number) <= model.MAX_NUMBER:
+        raise AirportError(f"{where}: {shown(text)}: must be a finite number of metres, within "
+                           f"{model.MAX_NUMBER:,.0f} m of 0")
     return number
 
 
