@@ -1,4 +1,4 @@
-"""The paper's robot in virtual time without a mission, and an operator with a stick."""
+"""A shipped robot in virtual time without a mission, and an operator with a stick."""
 
 from __future__ import annotations
 
@@ -85,13 +85,13 @@ class Driven:
 
 
 @asynccontextmanager
-async def driven(*, without: tuple[str, ...] = ()):
-    """Start the paper's system; without a mission the robot stands and waits for its operator."""
-    async with VirtualSystem.load("paper", seed=1, waits=True) as system:
+async def driven(name: str = "paper", *, without: tuple[str, ...] = ()):
+    """Start a shipped system; without a mission the robot stands and waits for its operator."""
+    async with VirtualSystem.load(name, seed=1, waits=True) as system:
         robot = Driven(system)
-        for name in system.layout.members:
-            if name not in ("supervisor", *without):
-                system.start_node(name)
+        for node in system.layout.members:
+            if node not in ("supervisor", *without):
+                system.start_node(node)
         await asyncio.sleep(1.5)
         try:
             yield robot

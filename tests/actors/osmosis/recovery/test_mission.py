@@ -8,16 +8,17 @@ import pytest
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.messages import MissionPhase, Mode
 from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.osmosis.recovery.return_home import ReturnHome
 from rampart.actors.runtime.actor import Actor, on
 from rampart.testing import run
-from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.recovery.world import Boss
 from tests.osmosis_system import System
 
+AIRPORT = load_airport("vallombre")
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
 
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.testing import run
-from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
 from tests.actors.osmosis.control.world import World
@@ -127,7 +127,7 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
     """Also after a message from the future."""
 
     async def scenario() -> list[tuple[float, float]]:
-        async with System(system=shipped_system(), airport=AIRPORT) as system:
+        async with System(system=shipped_system(), airport=load_airport("vallombre")) as system:
             return await driven(system)
 
     async def driven(system: System) -> list[tuple[float, float]]:

@@ -1,132 +1,173 @@
-"""Orders to the Mission Manager, and the robot's truth in the mission's state: whole chains."""
+"""Orders to the Mission Manager, and the robot's truth in the mission's state: shipped systems."""
 
 from __future__ import annotations
 
 import asyncio
 import math
+from itertools import groupby
 
 import pytest
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, PilotMode
-from tests.actors.osmosis.control import house
-from tests.actors.osmosis.control.house import AIRPORT
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode
+from rampart.testing import run
+from tests.actors.osmosis.control.laser_sweeps import full_sweep
+from tests.actors.osmosis.driven_robot import Driven, driven
+from tests.osmosis_system import in_system, shipped_system
 
+AIRPORT = load_airport("vallombre")
 START = AIRPORT.start
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
 ROW = m.Goal(-22.0, -18.5, Mode.TAXI)
+STANDING = 0.02
 
 
-def play(scenario):
-    house.play(scenario, DOWN, ROW)
+class Operator:
+    """Who orders, and what is heard of the mission."""
+
+    def __init__(self, robot: Driven) -> None:
+        self.robot = robot
+        self.heard = robot.system.hear(topics.MISSION_STATUS)
+        self.routes = robot.system.hear(topics.ROUTE)
+        self.answers = robot.system.hear(topics.MISSION_ORDER_ANSWER)
+        self._orders = 0
+
+    @property
+    def status(self) -> m.MissionStatus:
+        return self.heard[-1].message
+
+    @property
+    def phases(self) -> list[str]:
+        return [phase for phase, _ in groupby(h.message.phase.value for h in self.heard)]
+
+    @property
+    def place(self) -> tuple[float, float]:
+        return self.robot.truth.pose.x_m, self.robot.truth.pose.y_m
+
+    def ask(self, action: MissionAction, reason: str = "a reason") -> None:
+        self._orders += 1
+        self.robot.system.say(topics.MISSION_ORDER, m.MissionOrder(
+            f"o{self._orders}", action, reason, "operator"))
+
+    async def until(self, phase: MissionPhase, within_s: float) -> None:
+        await self.robot.until(lambda: self.status.phase is phase, within_s)
 
 
-def place(house):
-    return house.base.world.x_m, house.base.world.y_m
+def play(scenario, system: str = "osmosis") -> None:
+    """Run a scenario five seconds into a mission."""
+    async def scene() -> None:
+        async with driven(system) as robot:
+            operator = Operator(robot)
+            robot.system.say(topics.MISSION_REQUEST, m.MissionRequest("m1", "test", (DOWN, ROW)))
+            await asyncio.sleep(5.0)
+            await scenario(robot, operator)
 
-
-def standing(house):
-    return house.base.command == m.BaseCommand(0.0, 0.0)
+    run(scene)
 
 
 def test_pause_and_resume():
-    async def scenario(house, operator):
+    async def scenario(robot, operator):
         operator.ask(MissionAction.PAUSE, "aircraft passing")
         await asyncio.sleep(1.5)
-        assert standing(house)
+        assert robot.speed_mps < STANDING
         assert operator.status.phase is MissionPhase.PAUSED
         assert operator.status.reason == "operator: aircraft passing"
-        where = place(house)
+        where = operator.place
         await asyncio.sleep(5.0)
-        assert place(house) == pytest.approx(where, abs=0.01)
+        assert operator.place == pytest.approx(where, abs=0.01)
         operator.ask(MissionAction.PAUSE)
         operator.ask(MissionAction.RESUME)
-        await house.until(MissionPhase.SUCCEEDED, 90)
-        assert [a.accepted for a in operator.answers] == [True, False, True]
-        assert operator.answers[1].reason == (
+        await operator.until(MissionPhase.SUCCEEDED, 90)
+        assert [answer.message.accepted for answer in operator.answers] == [True, False, True]
+        assert operator.answers[1].message.reason == (
             "the mission is already paused, operator: aircraft passing")
 
     play(scenario)
 
 
 def test_home():
-    async def scenario(house, operator):
+    async def scenario(robot, operator):
         await asyncio.sleep(6.0)
         operator.ask(MissionAction.HOME, "rain")
-        await house.until(MissionPhase.CANCELLED, 60)
-        assert operator.phases == ["idle", "running", "returning home", "cancelled"]
+        await operator.until(MissionPhase.CANCELLED, 60)
+        assert operator.phases == ["running", "returning home", "cancelled"]
         assert operator.status.reason == "returned home, operator: rain"
-        assert math.dist(place(house), (START.x_m, START.y_m)) < 1.1
+        assert math.dist(operator.place, (START.x_m, START.y_m)) < 1.1
         await asyncio.sleep(1.0)
-        assert standing(house)
+        assert robot.speed_mps < STANDING
 
-    play(scenario)
+    play(scenario, "paper")
 
 
 def test_another_plan_then_the_next_goal_and_then_none():
-    async def scenario(house, operator):
+    async def scenario(robot, operator):
         operator.ask(MissionAction.REPLAN)
         await asyncio.sleep(0.5)
-        assert operator.routes[-1].plan == operator.answers[-1].plan == 1
+        assert operator.routes[-1].message.plan == operator.answers[-1].message.plan == 1
         assert operator.status.phase is MissionPhase.RUNNING
-        assert operator.command.linear_mps > 0.3, "without a stop"
+        assert robot.speed_mps > 0.3, "without a stop"
         operator.ask(MissionAction.SKIP, "closed")
         await asyncio.sleep(1.0)
         assert (operator.status.step, operator.status.skipped) == (1, (0,))
         operator.ask(MissionAction.CANCEL, "enough")
         await asyncio.sleep(1.5)
-        assert standing(house)
+        assert robot.speed_mps < STANDING
         assert operator.status.phase is MissionPhase.CANCELLED
 
     play(scenario)
 
 
 def test_the_operator_drives_elsewhere_and_hands_back_and_the_mission_goes_on_from_there():
-    async def scenario(house, operator):
-        operator.hold("RM5", PilotMode.TELEOPERATION)
-        await asyncio.sleep(2.0)
-        assert standing(house)
-        assert operator.status.reason == "held by RM5: DM6: localization not updated"
+    async def scenario(robot, operator):
+        robot.system.inject(topics.POSE, "drop", 12.0)
+        await asyncio.sleep(5.0)
+        assert robot.speed_mps < STANDING
+        assert operator.status.reason.startswith("held by RM5: DM6: localization not updated")
         operator.ask(MissionAction.RESUME)
         await asyncio.sleep(0.2)
-        assert "continues when the robot is released" in operator.answers[-1].reason
-        where = place(house)
-        for forward, left, ticks in ((0.0, 1.0, 60), (0.8, 0.0, 120)):
-            for _ in range(ticks):
-                operator.publish(topics.JOYSTICK, m.Joystick(forward, left, True))
-                await asyncio.sleep(0.05)
-        moved_m = math.dist(where, place(house))
-        assert moved_m > 2.0
+        assert "continues when the robot is released" in operator.answers[-1].message.reason
+        where = operator.place
+        robot.hold(0.0, 1.0)
+        await asyncio.sleep(1.5)
+        robot.hold(0.8)
+        await asyncio.sleep(4.0)
+        assert math.dist(where, operator.place) > 1.0
         assert operator.status.phase is MissionPhase.PAUSED
-        operator.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
+        robot.let_go()
         routes = len(operator.routes)
-        operator.release()
+        await operator.until(MissionPhase.RUNNING, 10)
         await asyncio.sleep(1.0)
-        anew = operator.routes[routes:][-1]
+        anew = operator.routes[routes:][-1].message
         assert anew.active
-        assert math.dist(anew.waypoints[0], place(house)) < 2.5, "planned from where it is now"
-        await house.until(MissionPhase.SUCCEEDED, 120)
-        assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]
+        assert math.dist(anew.waypoints[0], operator.place) < 2.5, "planned from where it is now"
+        await operator.until(MissionPhase.SUCCEEDED, 120)
+        assert operator.phases == ["running", "paused", "running", "succeeded"]
 
     play(scenario)
 
 
 @pytest.mark.parametrize("step", [0, 1])
-def test_a_wrong_route_is_refused_and_a_good_one_for_the_same_goal_driven_on(step):
-    async def scenario(house, operator):
-        control, good = house.actors["osmosis_control"], operator.routes[-1]
-        await house.kill("graph_planner")
-        bad = ((-29.0, 5.0), (20.0, 5.0), good.waypoints[-1])
-        control.route(m.Route(good.mission_id, step, good.mode, True, bad, ""), None)
-        await asyncio.sleep(1.5)
-        told = control.core.status
-        assert "crosses the prohibited area" in told.reason
-        if step == good.step:
-            assert told.phase is m.ControlPhase.FOLLOWING
-            assert operator.command.linear_mps > 0.2
-        else:
-            assert (told.phase, told.step) == (m.ControlPhase.REFUSED, step)
-            assert standing(house)
-
-    play(scenario)
+@in_system(system=shipped_system(), airport=AIRPORT)
+async def test_a_wrong_route_is_refused_and_a_good_one_for_the_same_goal_driven_on(system, step):
+    commands, told = system.hear(topics.COMMAND), system.hear(topics.CONTROL_STATUS)
+    system.start("control", OsmosisControl, check_route=True)
+    await system.settle()
+    end = (START.x_m, START.y_m - 8.0)
+    for i in range(60):
+        system.say(topics.POSE, m.Pose(START.x_m, START.y_m, START.yaw_rad))
+        system.say(topics.SCAN, full_sweep(number=i))
+        if i == 2:
+            good = ((START.x_m, START.y_m), end)
+            system.say(topics.ROUTE, m.Route("m1", 0, Mode.TAXI, True, good, ""))
+        elif i == 30:
+            bad = ((START.x_m, START.y_m), (20.0, 5.0), end)
+            system.say(topics.ROUTE, m.Route("m1", step, Mode.TAXI, True, bad, ""))
+        await asyncio.sleep(0.05)
+    status, command = told[-1].message, commands[-1].message
+    assert "crosses the prohibited area" in status.reason
+    assert (status.phase, status.step) == (
+        (m.ControlPhase.FOLLOWING, 0) if step == 0 else (m.ControlPhase.REFUSED, 1))
+    assert (command.linear_mps > 0.2) is (step == 0)
