@@ -110,6 +110,16 @@ def running(recorder: Recorder, *, is_told: bool = True) -> Iterator[None]:
         os.close(write_end)
 
 
+def pid_of(program: str, port: int) -> int | None:
+    """Return the pid of the recorder or black box of the run on a port; None if there is none."""
+    title = f"rampart-{program}[{port}/".encode()
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(title):
+                return int(entry.name)
+    return None
+
+
 class AnsweringLauncher:
     """Tells recorders and tools that there is a run on a port; a context manager."""
 

@@ -302,16 +302,6 @@ def test_a_damaged_description_hides_only_itself(box):
 # -- the process ----------------------------------------------------------------------------
 
 
-def box_pid(port):
-    """Return the pid of the black box of the run on a port; None if there is none."""
-    title = f"rampart-black-box[{port}/".encode()
-    for entry in Path("/proc").iterdir():
-        with contextlib.suppress(OSError):
-            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(title):
-                return int(entry.name)
-    return None
-
-
 def boxes():
     """Return the pids of this process's black boxes, also of those that are still starting."""
     found = []

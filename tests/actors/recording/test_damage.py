@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import shutil
 
 import pytest
 from mcap.reader import make_reader
@@ -122,18 +121,6 @@ def test_verbs_report_bytes_and_seconds_that_are_gone_and_exit_with_1(tmp_path, 
     found, reader = contents(tmp_path / "whole.mcap")
     assert (0 < len(found) < len(everything), reader.gaps) == (True, [])
     assert main(["bag", "info", str(tmp_path / "whole.mcap")]) == 0
-
-
-def test_a_bag_of_ros_2_reports_what_of_the_recording_is_gone(tmp_path, torn, capsys):
-    pytest.importorskip("rosbags")
-    path, _, hit = torn
-    assert main(["bag", "ros2", str(path), str(tmp_path / "ros"), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert sum(told["messages"].values()) > 0
-    assert [gone["from_byte"] for gone in told["gone"]] == [hit.chunk_start_offset]
-    shutil.rmtree(tmp_path / "ros")
-    assert main(["bag", "ros2", str(path), str(tmp_path / "ros")]) == 1
-    assert f"bytes {hit.chunk_start_offset} to" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("chunked", [True, False])

@@ -18,7 +18,8 @@ from rampart.cli.run import _black_box, black_box_folder
 from rampart.cli.run_options import parse
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
-from tests.actors.recording.test_black_box import Box, box_pid, crash, decision
+from tests.actors.recording.samples import pid_of
+from tests.actors.recording.test_black_box import Box, crash, decision
 from tests.osmosis_system import shipped_system
 
 CELL = ROOT / "tests" / "systems" / "cell.toml"
@@ -134,7 +135,7 @@ def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
         run.sleep_until(6.0)
         run.kill("localization")
         run.sleep_until(12.0)
-        box = box_pid(run.port)
+        box = pid_of("black-box", run.port)
         killed_s = (time.monotonic() - run.info.origin_s) * run.info.rate
         os.kill(box, signal.SIGKILL)
         os.kill(run.info.pid, signal.SIGKILL)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
@@ -14,7 +13,6 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
@@ -32,9 +30,16 @@ from rampart.actors.recording.process import Order, RecorderProcess, result_of
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
+from rampart.cli.record import record_verbs
 from rampart.testing import HEEDS_SIGNALS, RealRun, wait_until
 from tests import ROOT
-from tests.actors.recording.samples import AnsweringLauncher, documents, pose, running
+from tests.actors.recording.samples import (
+    AnsweringLauncher,
+    documents,
+    pid_of,
+    pose,
+    running,
+)
 from tests.porter_actors import write_porter_system
 
 
@@ -79,15 +84,6 @@ class Robot:
             self.connection.take(key, payload)
 
 
-def recorder_pid(port):
-    title = f"rampart-recorder[{port}/".encode()
-    for entry in Path("/proc").iterdir():
-        with contextlib.suppress(OSError):
-            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(title):
-                return int(entry.name)
-    return None
-
-
 @pytest.fixture
 def recording(port, launcher, tmp_path):
     """A recorder process, the launcher that it belongs to, and a robot of one node."""
@@ -127,7 +123,7 @@ def test_a_killed_recorder_leaves_a_readable_file_that_lacks_the_last_second_at_
         robot.send()  # not so many that they would fill a chunk, which is written when it is full
         sent_s.append(time.monotonic())
         time.sleep(0.02)
-    pid, killed_s = recorder_pid(port), time.monotonic()
+    pid, killed_s = pid_of("recorder", port), time.monotonic()
     os.kill(pid, signal.SIGKILL)
     kept = numbers(path)
     assert kept == list(range(1, len(kept) + 1))
@@ -144,7 +140,7 @@ def test_a_stopped_recorder_holds_nobody_up_and_what_did_not_fit_is_counted(reco
     process, robot, path = recording
     robot.send(10)
     wait_until(lambda: len(numbers(path)) == 10, 15, "nothing is written")
-    pid = recorder_pid(port)
+    pid = pid_of("recorder", port)
     os.kill(pid, signal.SIGSTOP)
     big = 40_000
     robot.send(big)  # far more than the kernel keeps
@@ -159,43 +155,14 @@ def test_a_stopped_recorder_holds_nobody_up_and_what_did_not_fit_is_counted(reco
     assert kept[-1] == big + 11
 
 
-def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
-        recording, port, launcher):
-    _, robot, path = recording
-    robot.send(100)
-    wait_until(path.exists, 15, "it has not begun")
-    robot.send(100)
-    robot.connection.close()
-    launcher.kill()
-    wait_until(lambda: recorder_pid(port) is None, 15, "the recorder was left")
-    assert numbers(path) == list(range(1, 201))
-    assert Summary(BagReader(path)).end["ended"] == "the run has ended"
-
-
-def test_who_ended_a_recording_is_told(recording, port):
-    _, robot, path = recording
-    robot.send(100)
-    wait_until(lambda: numbers(path), 15, "nothing is written")
-    os.kill(recorder_pid(port), signal.SIGTERM)
-    wait_until(lambda: recorder_pid(port) is None, 15, "it lives")
-    assert Summary(BagReader(path)).end["ended"] == "it was told to"
-
-
 def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recorder(
         port, tmp_path, dead):
-    read_end, write_end = os.pipe()
+    stop, write_end = os.pipe()
     recorder = Recorder(port, tmp_path / "run.mcap", launcher=dead)
     recorder.open()
-    assert recorder.run(read_end) == "the run has ended"
-    os.close(write_end)  # nobody reads that it is ready
-    os.close(read_end)
-    unread, answers = os.pipe()
-    os.close(unread)
-    order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
-    done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order],
-                          cwd=ROOT, stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
-    os.close(answers)
-    assert (done.returncode, done.stderr) == (0, b"")
+    assert recorder.run(stop) == "the run has ended"
+    os.close(write_end)
+    os.close(stop)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -225,7 +192,7 @@ def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkey
     recorder = RecorderProcess(Order(port, str(tmp_path / "run.mcap"), os.getpid()))
     with pytest.raises(BagError, match=r"the recorder did not start within 0\.2 s"):
         recorder.start()
-    assert recorder_pid(port) is None
+    assert pid_of("recorder", port) is None
     recorder.end()
 
 
@@ -238,12 +205,12 @@ def test_a_recorder_that_is_stopped_when_its_launcher_dies_is_not_left_over(port
     parent = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE,
                               stdout=subprocess.PIPE, cwd=ROOT, text=True)
     assert parent.stdout.readline().strip() == "started"
-    os.kill(recorder_pid(port), signal.SIGSTOP)
+    os.kill(pid_of("recorder", port), signal.SIGSTOP)
     parent.kill()
     parent.wait()
     parent.stdin.close()
     parent.stdout.close()
-    wait_until(lambda: recorder_pid(port) is None, 15, "the recorder was left")
+    wait_until(lambda: pid_of("recorder", port) is None, 15, "the recorder was left")
 
 
 def test_what_a_node_sent_before_it_was_killed_is_recorded(recording, port):
@@ -269,7 +236,7 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
         process.start()
         robot = Robot(port)
         robot.send(10)
-        wait_until(lambda: recorder_pid(port) is None, 15, "it lives")
+        wait_until(lambda: pid_of("recorder", port) is None, 15, "it lives")
         robot.send(10)
         wait_until(lambda: "No space left" in process.problem(), 5, "it does not say why")
         process.end()
@@ -277,24 +244,6 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
     error = capfd.readouterr().err
     assert "/dev/full: No space left on device: the recording ends after" in error
     assert error.count("\n") == 1
-
-
-def test_a_recorder_that_dies_is_noticed_and_does_not_disturb_the_robot(recording, port):
-    process, robot, path = recording
-    robot.send(10)
-    wait_until(lambda: numbers(path), 10, "nothing is written")
-    assert process.problem() == ""
-    os.kill(recorder_pid(port), signal.SIGKILL)
-
-    def let_go() -> bool:
-        robot.send(100)  # raises nothing, waits for nothing
-        return not robot.connection._sockets
-
-    wait_until(let_go, 15, "the connection is still there")
-    wait_until(process.problem, 5, "it is not noticed")
-    problem = process.problem()
-    process.end()
-    assert problem == process.problem() != ""
 
 
 def test_a_recording_that_becomes_large_goes_on_in_another_file(
@@ -387,17 +336,8 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
     assert code == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
     own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "", (), "r1", 0, "porter")
-    monkeypatch.setattr("rampart.cli.record.record_verbs.find_run", lambda _port: own)
-    taken = tmp_path / "x.mcap"
-    taken.touch()
-    assert main(["record", str(taken), "--topics", "porter/*", "plan/route"]) == 2
-    assert "exists already" in capsys.readouterr().err  # the next thing that is checked
-    assert main(["record", str(taken), "--topics", "porter/*", "nothing/like/it"]) == 2
-    assert "--topics nothing/like/it: matches no topic" in capsys.readouterr().err
+    assert record_verbs._wanted(["porter/*"], own)("rampart/porter/speed")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
@@ -451,7 +391,7 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
         run.sleep_until(8)
         run.process.send_signal(signal.SIGTERM)
         run.result()
-    assert recorder_pid(run.port) is None
+    assert pid_of("recorder", run.port) is None
     summary = Summary(BagReader(path))
     assert (summary.reader.closed, summary.reader.damage) == (True, "")
     assert (summary.end["lost"], summary.end["ended"]) == ("{}", "the run has ended")
@@ -476,7 +416,7 @@ def test_a_recorder_that_dies_in_a_run_is_seen_by_status_result_and_report(tmp_p
     path = tmp_path / "run.mcap"
     with RealRun(tmp_path, "paper", "--record", str(path), "--rate", "2") as run:
         run.sleep_until(3)
-        os.kill(recorder_pid(run.port), signal.SIGKILL)
+        os.kill(pid_of("recorder", run.port), signal.SIGKILL)
         found = {}
 
         def seen():
