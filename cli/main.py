@@ -130,22 +130,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _as_if_last(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> list[str]:
-    """Return arguments with `--port` and `--json` of a family moved behind its verb."""
-    verbs = next(action.choices for action in parser._actions
-                 if isinstance(action, argparse._SubParsersAction))
-    family = verbs.get(arguments[0]) if arguments else None
-    if family is None or not any(
-            isinstance(action, argparse._SubParsersAction) for action in family._actions):
-        return list(arguments)
-    first, rest = arguments[0], list(arguments[1:])
-    early: list[str] = []
-    while rest and (rest[0] == "--json" or rest[0].partition("=")[0] == "--port"):
-        taken = 2 if rest[0] == "--port" else 1
-        early, rest = early + rest[:taken], rest[taken:]
-    return [first, *rest[:1], *early, *rest[1:]]
-
-
 def _run(arguments: Sequence[str]) -> int:
     working_folder.admit()  # for the user's actors, as in the processes of a run
     try:
@@ -159,7 +143,7 @@ def _run(arguments: Sequence[str]) -> int:
             if not arguments:
                 say_text(parser.format_help())
                 return 0
-            options = parser.parse_args(_as_if_last(parser, arguments))
+            options = parser.parse_args(arguments)
         return int(options.run(options))
     except NoEffectError as error:
         warn(str(error))

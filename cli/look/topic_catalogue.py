@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -82,9 +82,8 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: there is no run, and the shipped system lacks the topic.
-        UnreadableError: the system of the run, or one of its actors, cannot be loaded here, and the
-            engine lacks the topic.
+        UsageError: there is no run, and the shipped system lacks the topic; or the system of the
+            run, or one of its actors, cannot be loaded here, and the engine lacks the topic.
     """
     try:
         file = find_run(port).system_file
@@ -99,18 +98,8 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
         return known if _match(key, known) is not None else system_topics(spec)
     except ValueError as error:
         if _match(key, topics.ALL) is None:
-            raise UnreadableError(str(error)) from None
+            raise UsageError(str(error)) from None
         return topics.ALL
-
-
-def of_any_type(key: str) -> tuple[Topic[Any], str]:
-    """Return a topic of unknown type with a key, and its full key expression."""
-    short = key.removeprefix("/").removeprefix(f"{ROOT}/")
-    return Topic(short, cast("Any", Any), Qos.COMMAND, 0.0, "", ""), f"{ROOT}/{short}"
-
-
-class UnreadableError(UsageError):
-    """The type of a topic cannot be loaded here."""
 
 
 def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:

@@ -26,15 +26,13 @@ import msgspec
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.topic import ROOT
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.look.topic_catalogue import (
-    UnreadableError,
     check_member,
-    of_any_type,
     resolve,
     topics_for,
 )
@@ -131,7 +129,7 @@ async def topic_echo(options: argparse.Namespace) -> int:
     """
     positive("--count", options.count)
     positive("--duration", options.duration)
-    topic, key = _topic_of(options)
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
     done, seen = asyncio.Event(), itertools.count(1)
 
     def show(data: dict[str, Any], line: str) -> None:
@@ -176,7 +174,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
       rampart topic hz 'heartbeat/*' --duration 3 --json
     """
     positive("--duration", options.duration)
-    topic, key = _topic_of(options)
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration or (3.0 if options.json else None)
     async with connect(options.port) as session:
@@ -202,15 +200,6 @@ async def topic_hz(options: argparse.Namespace) -> int:
     if not arrivals:
         raise _nothing_came(options.key, duration_s)
     return 0
-
-
-def _topic_of(options: argparse.Namespace) -> tuple[Topic[Any], str]:
-    """Return the topic of a key; one of unknown type if its class cannot be loaded here."""
-    try:
-        return resolve(options.key, topics_for(options.key, options.port))
-    except UnreadableError as error:
-        warn(f"{error}; messages are shown as they describe themselves")
-        return of_any_type(options.key)
 
 
 async def _while_it_runs(session: Session, duration_s: float | None) -> AsyncIterator[float]:

@@ -1,8 +1,7 @@
-"""A recording as tables for spreadsheets and pandas: one file per topic, one row per message.
+"""A recording as tables for spreadsheets and pandas: one CSV file per topic, one row per message.
 
 The first column is `time_s`: simulated seconds, or wall-clock seconds in files of other tools. The
-others are the fields of the message, with dots if nested: `body.x_m`. A list is one cell: JSON in
-CSV, a list in Parquet, which needs the extra `export`.
+others are the fields of the message, with dots if nested: `body.x_m`. A list is JSON in a cell.
 """
 
 from __future__ import annotations
@@ -19,10 +18,6 @@ import msgspec
 
 from rampart.actors.recording.bag_reader import BagReader, key_of, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, complete
-from rampart.cli.verbs import extra
-
-_BATCH = 20_000
-"""Rows that are collected as Python objects before they become part of a table."""
 
 Row = dict[str, Any]
 
@@ -46,24 +41,30 @@ class Export:
         self._reader = reader
         self._wants = wants
 
-    def write(self, folder: Path, kind: str) -> None:
+    def write(self, folder: Path) -> None:
         """Write the tables into a new folder, or no folder.
-
-        Args:
-            folder: must not exist.
-            kind: `csv` or `parquet`.
 
         Raises:
             BagError: the folder exists or cannot be written, or the recording cannot be read.
-            UsageError: the extra is not installed.
         """
-        if kind == "parquet":
-            extra("export", "pyarrow.parquet")
         if folder.exists():
             raise BagError(f"{folder}: exists already; choose another name")
-        with complete(folder):
+        with complete(folder), ExitStack() as files:
             folder.mkdir()
-            (self._csv if kind == "csv" else self._parquet)(folder)
+            columns: dict[str, Row] = {}
+            for topic, row in self._rows():
+                columns.setdefault(topic, {}).update(dict.fromkeys(row))
+            tables = {
+                topic: csv.DictWriter(files.enter_context(
+                    path.open("w", newline="", encoding="utf-8")), list(columns[topic]))
+                for topic, path in _paths(folder, columns).items()}
+            for table in tables.values():
+                table.writeheader()
+            for topic, row in self._rows():
+                tables[topic].writerow({
+                    name: msgspec.json.encode(value).decode() if isinstance(value, list) else value
+                    for name, value in row.items()})
+                self.counts[topic] += 1
 
     def _rows(self) -> Iterator[tuple[str, Row]]:
         """Yield topic and row of each message."""
@@ -86,51 +87,9 @@ class Export:
                 continue
             yield channel.topic, {"time_s": message.log_time / 1e9 + zero_s, **_flat("", fields)}
 
-    def _csv(self, folder: Path) -> None:
-        columns: dict[str, Row] = {}
-        for topic, row in self._rows():
-            columns.setdefault(topic, {}).update(dict.fromkeys(row))
-        with ExitStack() as files:
-            tables = {
-                topic: csv.DictWriter(files.enter_context(
-                    path.open("w", newline="", encoding="utf-8")), list(columns[topic]))
-                for topic, path in _paths(folder, columns, "csv").items()}
-            for table in tables.values():
-                table.writeheader()
-            for topic, row in self._rows():
-                tables[topic].writerow({
-                    name: msgspec.json.encode(value).decode() if isinstance(value, list) else value
-                    for name, value in row.items()})
-                self.counts[topic] += 1
-
-    def _parquet(self, folder: Path) -> None:
-        arrow, parquet = extra("export", "pyarrow"), extra("export", "pyarrow.parquet")
-        parts: dict[str, list[Any]] = {}
-        waiting: dict[str, list[Row]] = {}
-
-        def pack(topic: str) -> None:
-            rows, waiting[topic] = waiting[topic], []
-            names = dict.fromkeys(name for row in rows for name in row)
-            parts.setdefault(topic, []).append(
-                arrow.table({name: [row.get(name) for row in rows] for name in names}))
-
-        for topic, row in self._rows():
-            waiting.setdefault(topic, []).append(row)
-            self.counts[topic] += 1
-            if len(waiting[topic]) == _BATCH:
-                pack(topic)
-        for topic, path in _paths(folder, waiting, "parquet").items():
-            try:
-                pack(topic)
-                parquet.write_table(
-                    arrow.concat_tables(parts.pop(topic), promote_options="permissive"), path)
-            except (arrow.ArrowInvalid, arrow.ArrowTypeError) as error:
-                self._leave_out(topic, f"a field with values of several types ({error})",
-                                self.counts.pop(topic))
-
-    def _leave_out(self, topic: str, why: str, times: int = 1) -> None:
+    def _leave_out(self, topic: str, why: str) -> None:
         count, first = self.left_out.get(topic, (0, why))
-        self.left_out[topic] = count + times, first
+        self.left_out[topic] = count + 1, first
 
 
 def _flat(name: str, value: Any) -> Row:
@@ -141,13 +100,13 @@ def _flat(name: str, value: Any) -> Row:
             for path, one in _flat(f"{name}.{key}".lstrip("."), part).items()}
 
 
-def _paths(folder: Path, topics: Any, suffix: str) -> dict[str, Path]:
+def _paths(folder: Path, topics: Any) -> dict[str, Path]:
     """Return a different file for each topic, such as `localization-pose.csv`."""
     paths: dict[str, Path] = {}
     for topic in topics:
         name = stem = re.sub(r"[^A-Za-z0-9_]+", "-", topic).strip("-")[:200] or "topic"
         number = 2
-        while (path := folder / f"{name}.{suffix}") in paths.values():
+        while (path := folder / f"{name}.csv") in paths.values():
             name, number = f"{stem}-{number}", number + 1
         paths[topic] = path
     return paths
