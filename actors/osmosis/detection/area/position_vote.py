@@ -121,6 +121,7 @@ class Track:
         if self.parity.gyro_agrees is not self._by_gyro:
             if self.parity.gyro_agrees:
                 self._align_rad = self.heading_rad - self._imu[1]
+                self.aligned = False  # by the wheels, which slip in a turn on the spot
             self._by_gyro = self.parity.gyro_agrees
         if dt_s > self._fresh_s:
             self.speed_mps = linear_mps

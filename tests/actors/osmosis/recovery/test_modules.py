@@ -48,19 +48,6 @@ async def test_the_brake_is_engaged_before_any_time_passes_and_stays_so(system):
     assert base.orders.count(False) == 6
 
 
-@in_system()
-async def test_a_brake_that_does_not_engage_is_a_failure_at_the_deadline_and_tried_further(system):
-    boss, base = await stopping(system, deaf=True)
-    boss.order("RM1")
-    await asyncio.sleep(1.9)
-    assert boss.phases == ["idle", "acting"]
-    await asyncio.sleep(0.2)
-    assert boss.phases == ["idle", "acting", "failed"]
-    base.deaf = False
-    await asyncio.sleep(0.4)
-    assert boss.phases == ["idle", "acting", "failed", "degraded"]
-
-
 @pytest.mark.parametrize("ordered_again", [False, True])
 @in_system()
 async def test_a_release_waits_for_the_brake_and_a_new_order_cancels_it(system, ordered_again):
@@ -153,45 +140,6 @@ async def test_a_stop_fulfils_the_order_to_switch_to_teleoperation(system):
         boss.order(ordered)
         await asyncio.sleep(0.5)
         assert (rm2.phase, rm5.phase) == (rm2_phase, fm.RecoveryPhase.DEGRADED)
-
-
-@in_system()
-async def test_a_pilot_that_does_not_obey_is_a_failure_and_one_that_comes_round_is_not(system):
-    boss, pilot = Boss(system), system.start("pilot", Pilot)
-    system.start("RM2", ControlledStop)
-    pilot.deaf = True
-    await system.settle()
-    boss.order("RM2")
-    await asyncio.sleep(2.1)
-    assert boss.phases == ["idle", "acting", "failed"]
-    boss.order("RM2", decision=2)
-    await system.settle()
-    assert boss.phases == ["idle", "acting", "failed", "acting"]
-    pilot.deaf = False
-    await asyncio.sleep(0.3)
-    assert boss.phases[-1] == "degraded"
-    pilot.orders.clear()
-    pilot.deaf = True  # respawned, and never listens again
-    await asyncio.sleep(1.9)
-    assert boss.phases[-1] == "degraded"
-    await asyncio.sleep(0.8)
-    assert boss.phases[-1] == "failed"
-
-
-@in_system()
-async def test_a_respawned_module_ends_the_order_its_earlier_life_left_only_when_told(system):
-    boss, pilot = Boss(system), system.start("pilot", Pilot)
-    system.start("RM2", ControlledStop)
-    await system.settle()
-    boss.order("RM2")
-    await system.settle()
-    await system.kill("RM2")
-    system.start("RM2", ControlledStop)
-    await asyncio.sleep(1.0)
-    assert pilot.mode is PilotMode.STOP
-    boss.release("RM2")
-    await system.settle()
-    assert pilot.mode is PilotMode.AUTO
 
 
 # ---- RM3, RM4 ----------------------------------------------------------------------------------

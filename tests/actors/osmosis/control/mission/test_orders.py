@@ -88,7 +88,9 @@ def test_pause_and_resume():
     play(scenario)
 
 
-def test_home():
+@pytest.mark.parametrize("system", ["paper", "osmosis"])
+def test_home(system):
+    """The turn on the spot, in which the wheels slip, is held against no position (DM1)."""
     async def scenario(robot, operator):
         await asyncio.sleep(6.0)
         operator.ask(MissionAction.HOME, "rain")
@@ -99,7 +101,7 @@ def test_home():
         await asyncio.sleep(1.0)
         assert robot.speed_mps < STANDING
 
-    play(scenario, "paper")
+    play(scenario, system)
 
 
 def test_another_plan_then_the_next_goal_and_then_none():
