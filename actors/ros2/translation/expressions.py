@@ -6,10 +6,9 @@ angle_deg * 0.017453292519943295
 yaw(pose.pose.orientation)      heading of a quaternion, rad, in (-pi, pi]
 quaternion(yaw_rad)             the quaternion of a heading
 sqrt(position_covariance[0])    square root; NaN of a negative number
-least(ranges), greatest(ranges) of a list without its NaNs; NaN of an empty one
+least(ranges)                   of a list without its NaNs; NaN of an empty one
 east(latitude, longitude)       m east of the datum, on the plane that touches the ellipsoid there
 north(latitude, longitude)      m north of the datum
-latitude(x_m, y_m), longitude(x_m, y_m)     the inverse, degrees
 count(status)                   number of items of a list
 """
 
@@ -65,11 +64,6 @@ def least(values: Sequence[float]) -> float:
     return min((float(v) for v in values if not math.isnan(v)), default=math.nan)
 
 
-def greatest(values: Sequence[float]) -> float:
-    """Return the greatest number of a list, NaN if it is empty."""
-    return max((float(v) for v in values if not math.isnan(v)), default=math.nan)
-
-
 class Plane:
     """The plane that touches the ellipsoid at a point.
 
@@ -94,19 +88,11 @@ class Plane:
         """Return the distance of a point to the north, m."""
         return (latitude_deg - self._latitude_deg) * self._north_m
 
-    def latitude(self, _east_m: float, north_m: float) -> float:
-        """Return the latitude of a point, degrees."""
-        return self._latitude_deg + north_m / self._north_m
-
-    def longitude(self, east_m: float, _north_m: float) -> float:
-        """Return the longitude of a point, degrees."""
-        return self._longitude_deg + east_m / self._east_m
-
 
 _FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "yaw": (yaw, 1), "quaternion": (quaternion, 1), "sqrt": (sqrt, 1), "least": (least, 1),
-    "greatest": (greatest, 1), "count": (len, 1)}
-_ON_PLANE = ("east", "north", "latitude", "longitude")
+    "count": (len, 1)}
+_ON_PLANE = ("east", "north")
 FUNCTIONS = (*_FUNCTIONS, *_ON_PLANE)
 
 

@@ -364,18 +364,17 @@ class Outward:
         if not (said or lenient):
             raise ValueError(f"fields: no field of {link.type} has a value; {source.__name__} "
                              f"has {', '.join(there.values()) or 'no fields'}")
-        plane = Plane(link.datum) if link.datum else None
         self._source, self._leaves = source.__name__, leaves
-        self._writes = [(*_place(fields, where), self._read(where, one, plane, fields))
+        self._writes = [(*_place(fields, where), self._read(where, one, fields))
                         for where, one in said.items()]
 
-    def _read(self, where: str, said: str | float | bool, plane: Plane | None, fields: TypeFields
+    def _read(self, where: str, said: str | float | bool, fields: TypeFields
               ) -> Callable[[Any, HasSource | None], Any]:
         if not isinstance(said, str):
             return lambda _message, _header: said
         if said == "@source":
             return lambda _message, header: header.source if header else ""
-        expression = Expression(said, plane)
+        expression = Expression(said)
         for path in expression.paths:
             if path not in self._leaves:
                 raise ValueError(f"fields: {said!r}: {self._source} has no field {path!r}"

@@ -252,43 +252,32 @@ class Types:
                 definitions |= self._parsed(f"{package}/{kind}/{name}", kind, text)
             except (ValueError, OSError) as error:
                 raise ValueError(f"{file}: {_line(error)}") from None
-        usable = self._usable(definitions)
-        for name in definitions.keys() - usable.keys():
-            self.left_out[name] = self._why_not(name, definitions, usable)
+        unusable = self._unusable(definitions)
+        self.left_out |= unusable
         for names in (self._services, self._actions):
-            names.difference_update(self.left_out)
+            names.difference_update(unusable)
         try:
-            self._add(usable)
+            self._add({name: made for name, made in definitions.items() if name not in unusable})
         except ValueError as error:
             raise ValueError(f"{folder}: {error}") from None
         return bool(found)
 
-    def _usable(self, definitions: Mapping[str, tuple[Any, Fields]]) -> dict[str, Any]:
-        """Return the definitions that contain only known types."""
-        usable: dict[str, Any] = {}
-        rest = dict(definitions)
-        while True:
-            known = {name: definition for name, definition in rest.items() if all(
-                part in usable or (part in self._store.fielddefs and part not in definitions)
-                for part in _parts(definition[1]))}
-            if not known:
-                return usable
-            usable |= known
-            for name in known:
+    def _unusable(self, definitions: Mapping[str, tuple[Any, Fields]]) -> dict[str, str]:
+        """Return the definitions with a part that cannot be used, each with the reason."""
+        known = self._store.fielddefs.keys() - definitions.keys()
+        rest = {name: _parts(fields) for name, (_, fields) in definitions.items()}
+        while ready := [name for name, parts in rest.items() if known.issuperset(parts)]:
+            known |= set(ready)
+            for name in ready:
                 del rest[name]
-
-    def _why_not(self, name: str, definitions: Mapping[str, tuple[Any, Fields]],
-                 usable: Mapping[str, Any]) -> str:
-        """Return why a definition cannot be used, following its types to the first unknown one."""
-        way = [name]
-        while way[-1] in definitions and way.count(way[-1]) == 1:
-            way += [next(part for part in _parts(definitions[way[-1]][1]) if part not in usable
-                         and (part in definitions or part not in self._store.fielddefs))]
-        if way[-1] in definitions:
-            return f"contains itself, {' -> '.join(way)}"
-        what = way[-1].rpartition("/")[2]
-        return (f"{way[-2]} has a {what}, which is not supported" if what in _UNSUPPORTED
-                else f"{way[-2]}: type {way[-1]!r} is not known")
+        found = {}
+        for name, parts in rest.items():
+            part = next(part for part in parts if part not in known)
+            what = part.rpartition("/")[2]
+            found[name] = f"{name} has a {what}, which is not supported" if (
+                what in _UNSUPPORTED) else f"{name}: type {part!r} " + (
+                "is left out, too" if part in rest else "is not known")
+        return found
 
     def _add(self, definitions: Mapping[str, tuple[Any, Fields]]) -> None:
         for name, (_, fields) in definitions.items():
