@@ -40,11 +40,10 @@ def say(**what):
 
 
 class Camera(LifecycleNode):
-    """A node with states and a parameter."""
+    """A node with states."""
 
     def __init__(self):
         super().__init__("camera")
-        self.declare_parameter("rate_hz", 12.5)
 
     def on_configure(self, state):
         say(state="inactive")

@@ -211,35 +211,25 @@ async def started(system, *modules):
 
 @beside(REPORTS)
 async def test_an_error_in_the_diagnostics_is_named_until_it_is_over(system):
+    """The gateway's own report kept a module active; a second node's message replaced a first."""
     reporter, changes = await started(system, "D_STATUS")
     assert changes("D_STATUS") == [("idle", "")]
-    reporter.statuses = {"lidar: driver": (0, "ok"), "lidar: heat": (2, "91 °C")}
+    reporter.statuses = {"arm": (2, "91 °C")}
     await asyncio.sleep(0.5)
-    reporter.statuses = {"lidar: driver": (0, "ok"), "lidar: heat": (0, "60 °C")}
+    reporter.statuses = {"arm": (0, "60 °C")}
     await asyncio.sleep(1.0)
-    assert changes("D_STATUS") == [
-        ("idle", ""), ("active", "lidar: heat: error: 91 °C"), ("idle", "")]
-
-
-@beside(REPORTS)
-async def test_a_module_does_not_take_the_gateway_s_own_diagnostics_for_those_of_the_robot(system):
-    _, changes = await started(system, "D_STATUS")
+    assert changes("D_STATUS") == [("idle", ""), ("active", "arm: error: 91 °C"), ("idle", "")]
     await system.kill("reporter")
     await asyncio.sleep(3.0)  # the gateway reports D_STATUS itself as an error now
-    system.start_node("reporter")
+    assert changes("D_STATUS")[3:] == [("active", "arm: no status for 2 s")]
+    reporter = system.start_node("reporter")
     await asyncio.sleep(1.0)
-    assert changes("D_STATUS") == [("idle", ""), ("active", "arm: no status for 2 s"), ("idle", "")]
-
-
-@beside(REPORTS)
-async def test_two_nodes_that_report_at_once_are_both_heard(system):
-    """The second one's message replaced the first one's, as of a sensor."""
-    reporter, changes = await started(system, "D_STATUS")
+    assert changes("D_STATUS")[4:] == [("idle", "")]
     reporter.is_silent = True
     reporter.report({"lidar": (2, "no data")})
     reporter.report({"camera": (0, "ok")})
     await asyncio.sleep(0.1)
-    assert changes("D_STATUS")[-1] == ("active", "lidar: error: no data")
+    assert changes("D_STATUS")[5:] == [("active", "lidar: error: no data")]
 
 
 @beside(REPORTS)
