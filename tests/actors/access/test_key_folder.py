@@ -96,6 +96,12 @@ def test_a_certificate_says_who_where_and_for_how_long(keys):
     assert set(before.addresses) == {
         "127.0.0.1", "::1", "localhost", "10.0.0.2", "rover.local", "fe80::1"}
     assert rotate(keys, ["router_a"]) == ["router_a"]
+    for name, purpose, works in (("DM4", "sslclient", True), ("DM4", "sslserver", False),
+                                 ("router_a", "sslserver", True), ("router_a", "sslclient", True)):
+        done = subprocess.run(
+            ["openssl", "verify", "-CAfile", keys / "ca.crt", "-purpose", purpose,
+             keys / f"{name}.pem"], capture_output=True, text=True, check=False)
+        assert (done.returncode == 0) == works, (name, purpose, done.stderr)
     after = certificate(keys, "router_a")
     assert after.fingerprint != before.fingerprint
     assert (after.common_name, after.addresses) == ("router_a", before.addresses)
@@ -107,17 +113,6 @@ def test_a_certificate_says_who_where_and_for_how_long(keys):
 def test_an_address_is_one_of_ip_or_the_name_of_a_host(text, is_one):
     with contextlib.nullcontext() if is_one else pytest.raises(ValueError, match="an IP address"):
         check_address(text)
-
-
-def test_openssl_verifies_what_is_issued(keys):
-    issue(keys, ["DM4"], "node")
-    issue(keys, ["router_a"], "router")
-    for name, purpose, works in (("DM4", "sslclient", True), ("DM4", "sslserver", False),
-                                 ("router_a", "sslserver", True), ("router_a", "sslclient", True)):
-        done = subprocess.run(
-            ["openssl", "verify", "-CAfile", keys / "ca.crt", "-purpose", purpose,
-             keys / f"{name}.pem"], capture_output=True, text=True, check=False)
-        assert (done.returncode == 0) == works, (name, purpose, done.stderr)
 
 
 def test_an_impossible_change_of_a_folder_is_refused_in_one_line(keys):
@@ -142,16 +137,6 @@ def test_an_impossible_change_of_a_folder_is_refused_in_one_line(keys):
             what()
 
 
-def test_a_revoked_name_comes_back_as_somebody_else(keys):
-    issue(keys, ["ada"], "operator")
-    revoke(keys, ["ada"])
-    assert not (keys / "ada.pem").exists()
-    assert read_register(keys).of_kind("operator") == {}
-    issue(keys, ["ada"], "operator")
-    assert read_register(keys).of_kind("operator") == {"ada": "ada.2"}
-    assert certificate(keys, "ada").common_name == "ada.2"
-
-
 def test_a_run_is_started_with_certificates_that_are_valid(keys):
     issue(keys, ["DM4", "DM5"], "node")
     assert check(keys, ["DM4", "DM5"]) > NOW + dt.timedelta(days=29)
@@ -171,8 +156,11 @@ def test_a_run_is_started_with_certificates_that_are_valid(keys):
     assert "valid from" in why()
     assert "`rampart keys rotate` renews it" in why()
     revoke(keys, ["DM5"])
+    assert not (keys / "DM5.pem").exists()
     assert why() == "DM5.pem: DM5 is revoked; `rampart keys issue` gives it one"
     issue(keys, ["DM5"], "node")
+    assert read_register(keys).of_kind("node") == {"DM4": "DM4", "DM5": "DM5.2"}
+    assert certificate(keys, "DM5").common_name == "DM5.2", "it comes back as somebody else"
     other = keys.parent / "other"
     init(other)
     issue(other, ["DM5"], "node")
@@ -183,9 +171,7 @@ def test_a_run_is_started_with_certificates_that_are_valid(keys):
 
 
 @pytest.mark.parametrize("text", [
-    "", "[]", "{", '{"identities": {"a b": {"kind": "node"}}}', "[" * 100_000,
-    '{"identities": {"DM4": {"kind": "king"}}}',
-    '{"identities": {"DM4": {"kind": "node", "x": 1}}}',
+    "", "[" * 100_000, '{"identities": {"a b": {"kind": "node"}}}',
     '{"identities": {"DM4": {"kind": "node", "number": 0}}}', "\udcff"])
 def test_a_register_that_is_none_is_refused(keys, text):
     (keys / "register.json").write_text(text, errors="surrogateescape")

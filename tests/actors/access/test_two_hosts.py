@@ -72,21 +72,17 @@ def heard_by(session, key):
 
 
 def test_messages_and_questions_cross_both_ways(hosts):
-    with linked(hosts), hosts.client("ftm_manager") as manager, hosts.client("DM5") as module:
+    with linked(hosts), hosts.client("ftm_manager") as manager, hosts.client("DM5") as module, \
+            hosts.client("teleoperation") as teleoperation:
         reports, _a = heard_by(manager, "rampart/detection/*")
-        orders, _b = heard_by(module, "rampart/heartbeat/teleoperation")
+        beats, _b = heard_by(module, "rampart/heartbeat/teleoperation")
 
-        def reported():
+        def have_crossed():
             module.put("rampart/detection/DM5", "active")
-            return b"active" in reports
+            teleoperation.put("rampart/heartbeat/teleoperation", "beat")
+            return b"active" in reports and b"beat" in beats
 
-        assert wait_for(reported)
-        with hosts.client("teleoperation") as teleoperation:
-            def beats():
-                teleoperation.put("rampart/heartbeat/teleoperation", "beat")
-                return b"beat" in orders
-
-            assert wait_for(beats)
+        assert wait_for(have_crossed)
     with linked(hosts), hosts.client("hmi") as page, hosts.client("safety_pilot") as pilot:
         answering = pilot.declare_queryable(
             "rampart/pilot/status", lambda q: q.reply("rampart/pilot/status", "drives"))

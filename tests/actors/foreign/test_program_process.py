@@ -7,15 +7,14 @@ import functools
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
-import time
 import traceback
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from rampart.actors.foreign.descendants import descendants, is_below, kill_all
@@ -24,8 +23,7 @@ from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket
 from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
-from rampart.testing import eventually
-from tests import ROOT
+from rampart.testing import eventually, wait_until
 
 FORKS = """
 setsid sh -c 'trap "" TERM; while :; do sleep 600; done' &
@@ -48,24 +46,10 @@ class Started:
 
     async def end(self) -> str:
         """Wait for its end and return it."""
-        until_s = time.monotonic() + 10
-        while not self.ends and time.monotonic() < until_s:
-            await asyncio.sleep(0.005)
-        assert len(self.ends) == 1
-        return self.ends[0]
+        await eventually(lambda: self.ends)
+        (end,) = self.ends
+        return end
 
-    async def forked(self, number: int) -> set[int]:
-        """Wait for so many processes, and return them."""
-        until_s = time.monotonic() + 10
-        while len(found := descendants(os.getpid())) < number and time.monotonic() < until_s:
-            await asyncio.sleep(0.01)
-        assert len(found) >= number
-        return found
-
-
-def proc(name: str) -> Iterator[Path]:
-    """Return such a file of each process."""
-    return (file for file in Path("/proc").glob(f"[0-9]*/{name}") if file.exists())
 
 
 def isolated(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
@@ -110,7 +94,8 @@ async def test_all_that_it_has_forked_ends_with_it(tmp_path, how):
     rest = "read _ < go" if how == "ends" else "trap '' TERM; while :; do sleep 603; done"
     os.mkfifo(tmp_path / "go")
     started = Started(tmp_path, FORKS + rest)
-    pids = await started.forked(5)
+    await eventually(lambda: len(descendants(os.getpid())) >= 5)
+    pids = descendants(os.getpid())
     if how == "ends":
         (tmp_path / "go").write_text("\n")
         assert await started.end() == "ended: exit code 0"
@@ -128,11 +113,9 @@ async def test_all_that_it_has_forked_ends_with_it(tmp_path, how):
 async def test_it_may_end_in_order_when_it_is_asked_to_also_if_it_is_stopped(tmp_path):
     started = Started(tmp_path, "trap 'head -c 300000 /dev/zero; echo bye; exit' TERM; echo up; "
                                 "while :; do sleep 0.01; done")
-    while "up" not in (started.log.read_text() if started.log.exists() else ""):
-        await asyncio.sleep(0.01)
+    await eventually(lambda: started.log.exists() and "up" in started.log.read_text())
     os.kill(started.process.pid, signal.SIGSTOP)
-    while not started.process.is_stopped:
-        await asyncio.sleep(0.01)
+    await eventually(lambda: started.process.is_stopped)
     started.process.end()
     assert started.log.read_bytes().endswith(b"bye\n")
 
@@ -144,8 +127,8 @@ async def test_daemons_that_end_before_it_leave_no_zombies(tmp_path):
                                 "read _ < go; exit 4")
     ends = tmp_path / "ends"
     await eventually(lambda: ends.exists() and len(ends.read_text()) == 3)
-    await eventually(lambda: ["Z", str(os.getpid())] not in [
-        file.read_text().rpartition(")")[2].split()[:2] for file in proc("stat")])
+    await eventually(lambda: not any(
+        one.status() == psutil.STATUS_ZOMBIE for one in psutil.Process().children()))
     (tmp_path / "go").write_text("\n")
     assert await started.end() == "ended: exit code 4"
 
@@ -194,40 +177,17 @@ async def test_limits_and_signals_are_those_of_the_program_and_not_of_this_proce
         Started(tmp_path, "", open_files=mine[1] + 1)
 
 
-PARENT = """
-import asyncio, os, sys
-from pathlib import Path
-from rampart.actors.foreign.output_log import OutputLog
-from rampart.actors.foreign.program_process import ProgramProcess
-from rampart.manager.spec.nodes import ChildLimits
-
-async def main():
-    ProgramProcess("/bin/sh", ["-c", sys.argv[2]], folder=Path(sys.argv[1]),
-                   environment=dict(os.environ), limits=ChildLimits(),
-                   log=OutputLog(Path(sys.argv[1], "it.log")), inherited=[], ended=print)
-    await asyncio.sleep(600)
-
-asyncio.run(main())
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_the_program_ends_with_the_process_of_its_node(tmp_path, number):
-    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path), "sleep 600; true"],
-                              cwd=ROOT)
-    try:
-        until_s = time.monotonic() + 20
-        while len(pids := descendants(parent.pid)) < 2 and time.monotonic() < until_s:
-            time.sleep(0.01)
-        program = next(pid for pid in pids if is_below(pid, parent.pid)
-                       and Path(f"/proc/{pid}/stat").read_text().split()[3] == str(parent.pid))
-        os.kill(parent.pid, number)
-        parent.wait()
-        while process_state(program) not in "XZ" and time.monotonic() < until_s:
-            time.sleep(0.001)
-        assert process_state(program) in "XZ"
-    finally:
-        kill_all(lambda: [pid for pid in pids if process_state(pid) not in "XZ"])
+def test_all_below_a_process_are_found_and_killed():
+    with subprocess.Popen(["sh", "-c", "sh -c 'sleep 600; true' & sleep 601; true"]) as parent:
+        try:
+            wait_until(lambda: len(descendants(parent.pid)) == 3)
+            pids = descendants(parent.pid)
+            assert all(is_below(pid, parent.pid) for pid in pids)
+            assert not is_below(parent.pid, min(pids))
+            kill_all(lambda: [pid for pid in pids if process_state(pid) not in "XZ"])
+            assert are_gone(pids)
+        finally:
+            parent.kill()
 
 
 SEND = """
@@ -238,16 +198,6 @@ print("sent", flush=True)
 sys.stdin.read()
 """
 SEND_BELOW = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {SEND!r}, 'below'])"
-
-
-NODE = """
-from rampart.actors.foreign.pulse import NotifySocket
-refused = []
-notify = NotifySocket("wheels", lambda *why: refused.append(why))
-print(notify.name, flush=True)
-input()
-print(notify.take(), len(refused))
-"""
 
 
 def test_a_datagram_of_a_living_descendant_counts_and_no_other():
@@ -262,12 +212,11 @@ def test_a_datagram_of_a_living_descendant_counts_and_no_other():
     assert refused == []
     subprocess.run([sys.executable, "-c", SEND, "ended"], env=environment, check=True,
                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    assert notify.take() == []
-    assert len(refused) == 1
+    with subprocess.Popen(["sh", "-c", '"$@" <&0 &', "sh", sys.executable, "-c", SEND, "orphan"],
+                          env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as gone:
+        gone.wait()
+        assert gone.stdout.readline() == b"sent\n"  # by a process that lives, and not below
+        assert notify.take() == []
+        gone.stdin.close()
+    assert len(refused) == 2
     notify.close()
-    with subprocess.Popen([sys.executable, "-c", NODE], cwd=ROOT, text=True,
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as node:
-        name = node.stdout.readline().strip()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:  # above, alive
-            stranger.sendto(b"WATCHDOG=1", f"\0{name[1:]}")
-        assert node.communicate("\n")[0] == "[] 1\n"
