@@ -112,18 +112,22 @@ def test_the_toolbox_keeps_its_exit_code_too(tmp_path, arguments, redirected, co
 # -- the report ----------------------------------------------------------------------------------
 
 
-def test_an_unsafe_run_is_unsafe_though_its_report_does_not_fit_nor_its_recording(tmp_path):
-    done = subprocess.run(
-        unsafe(tmp_path, "--record", str(tmp_path / "run.mcap")), capture_output=True, text=True,
-        check=False, timeout=100, preexec_fn=small_files(5000))
-    assert done.returncode == UNSAFE, done.stderr
-    result = result_of(done.stdout)
+def test_an_unsafe_run_is_unsafe_though_its_report_or_recording_does_not_fit(tmp_path):
+    def limited(size: int, *more: str) -> tuple[dict, str]:
+        done = subprocess.run(unsafe(tmp_path, *more), capture_output=True, text=True, check=False,
+                              timeout=100, preexec_fn=small_files(size))
+        assert done.returncode == UNSAFE, done.stderr
+        return result_of(done.stdout), done.stderr
+
+    result, told = limited(5000)
     assert (result["safety"], result["report"], result["record"]) == ("unsafe", None, None)
     assert "File too large" in result["report_error"]
-    told = [line for line in done.stderr.splitlines() if "cannot be written" in line]
-    assert told == [f"launch.py: report: {result['report_error']}"]
+    assert [line for line in told.splitlines() if "cannot be written" in line] == [
+        f"launch.py: report: {result['report_error']}"]
     assert not (tmp_path / "report").exists(), "an empty folder, or half a report"
-    assert "run.mcap: File too large: the recording ends after" in done.stderr
+    result, told = limited(200_000, "--record", str(tmp_path / "run.mcap"))
+    assert result["safety"] == "unsafe"
+    assert "run.mcap: File too large: the recording ends after" in told
 
 
 def in_the_way(folder: Path) -> None:
