@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,7 @@ from rampart.actors.osmosis.control.mission.mission_state import (
     catch_up,
 )
 from rampart.actors.osmosis.control.polyline import NO_POINTS
-from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
-from rampart.actors.runtime.checkpoint_file import files_of, read
+from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, StateError
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import load_run
 from rampart.manager.arbitration.arbiter import build_arbiter
@@ -36,10 +34,9 @@ from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.virtual_run import VirtualRun
 from rampart.sim.virtual.virtual_processes import VirtualMachine
-from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.osmosis.control.world import Circle, World, drive
-from tests.whole.missions import SHORT_LIGHTS, write_near_mission, write_short_mission
+from tests.whole.missions import SHORT_LIGHTS, write_short_mission
 
 P = m.MissionPhase
 GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
@@ -300,49 +297,3 @@ def test_an_emergency_stop_outlives_recovery_module_and_manager(short):
     assert (record.mission, record.safety) == ("fail", "safe")
     assert record.restarts == {"RM1": 1, "ftm_manager": 1}
     assert record.decisions[-1].recoveries == ("RM1",)
-
-
-# -- real processes ------------------------------------------------------------------------------
-
-
-def kept_of(folder: Path, node: str) -> tuple[Record, ...]:
-    """Return the states that a node of the run that ended has kept."""
-    [report] = folder.parent.glob("inspection-*.json")
-    return read(folder, node, report.stem.removeprefix("inspection-")).records
-
-
-def fifo(file: Path) -> None:
-    file.unlink()
-    os.mkfifo(file)
-
-
-def noise(file: Path) -> None:
-    file.write_bytes(random.Random(16).randbytes(4000))
-
-
-def cut(file: Path) -> None:
-    with file.open("rb+") as opened:
-        opened.truncate(file.stat().st_size - 1)
-
-
-@pytest.mark.slow
-@pytest.mark.processes
-@pytest.mark.alone
-@pytest.mark.timeout(180)
-def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path):
-    files = tmp_path / "report" / "checkpoints"
-    nodes = {"mission_manager": cut, "graph_planner": fifo, "osmosis_control": noise,
-             "ftm_manager": noise}
-    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
-                 str(write_near_mission(tmp_path)), "--rate", "2") as run:
-        for index, (node, damage) in enumerate(nodes.items()):
-            run.sleep_until(5.0 + 4 * index)
-            found = files_of(files, node)
-            for age in [max(found)] if damage is cut else found:
-                damage(found[age])
-            run.kill(node)
-        code, result = run.result(120)
-    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
-    assert {node: result["restarts"].get(node) for node in nodes} == dict.fromkeys(nodes, 1)
-    for node in nodes:
-        assert kept_of(files, node), node

@@ -48,19 +48,6 @@ def restarted_by(run: RealRun, seconds: float, last: Sequence[str] = (), killed:
             if incarnation > 1 and names != ("pool",)}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.5, 10.0])
-@pytest.mark.parametrize("last", [(), ("supervisor",), ("router_a", "router_b")])
-def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(
-        tmp_path, seconds, last):
-    mission = write_near_mission(tmp_path)
-    with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:
-        run.sleep_until(4.0)
-        assert restarted_by(run, seconds, last) == set(), run.story
-        _, result = run.result()
-    assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
-
-
 def test_after_pauses_of_everybody_only_what_died_or_hangs_is_restarted(tmp_path):
     mission = write_near_mission(tmp_path)
     with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:

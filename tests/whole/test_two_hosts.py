@@ -20,7 +20,6 @@ from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of
 from rampart.testing import RealRun
 from tests import ROOT
-from tests.actors.access.keyed import every_key, layout_of, shown_by_strangers, try_all
 from tests.two_hosts import two_hosts
 from tests.whole.network import Line, Network, network, why_not
 
@@ -226,34 +225,6 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
     assert numbers == sorted(set(numbers))  # one after the other, and none given twice
     refused = [line for line in robot.story.splitlines() if "incarnation 1 of cell_manager" in line]
     assert all("was superseded by 1000001" in line for line in refused)
-
-
-@pytest.mark.slow
-def test_a_stranger_on_the_network_of_the_hosts_reads_nothing_and_is_not_heard(tmp_path):
-    """Every key of topics.md, at every router's port of both hosts, while a mission is driven."""
-    public = tmp_path / "public"
-    public.mkdir()
-    with network(["robot", "ground", "stranger"]) as net:
-        hosts = {name: net.addresses[name] for name in ("robot", "ground")}
-        spec = tmp_path / "two.toml"
-        spec.write_text(two_hosts(hosts), encoding="utf-8")
-        own = with_keys(tmp_path, spec)
-        shown = shown_by_strangers(public, tmp_path / "keys")
-        ports = {f"{kind}/{address}:{port}" for address in hosts.values()
-                 for port in (7460, 7461, 7462) for kind in ("tls", "tcp")}
-        with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
-              host(net, "robot", tmp_path / "r", spec, *own["robot"], "--mission", "A") as robot):
-            robot.wait_for("goal 1/", 60)
-            told = len(robot.story), len(ground.story)
-            found = try_all(sorted(ports), shown, every_key(layout_of("osmosis")),
-                            before=net.command("stranger"))
-            assert len(found["tried"]) == len(ports) * len(shown)
-            for what, one in found["tried"].items():
-                assert one["heard"] == 0, what
-            robot.wait_for("goal 2/", 120)
-            for run, before in zip((robot, ground), told, strict=True):
-                assert "payload rejected" not in run.story[before:], run.story
-                assert "unreachable" not in run.story[before:], run.story
 
 
 def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_path):

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime as dt
+import json
 import os
-import tempfile
-import threading
 import time
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -18,22 +15,11 @@ from rampart.actors.bus import run_folder
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, session_config
-from tests.actors.access.keyed import (
-    Keyed,
-    every_key,
-    layout_of,
-    make_keys,
-    opened,
-    shown_by_strangers,
-    try_all,
-    wait_for,
-)
-from tests.other_user import needs_root
+from tests.actors.access.keyed import Keyed, layout_of, make_keys, opened, wait_for
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 LAYOUT = layout_of("osmosis")
-KEYS = every_key(LAYOUT)
 NOW = dt.datetime.now(dt.UTC)
 
 
@@ -51,86 +37,34 @@ def keyed(folder, tmp_path_factory):
         yield one
 
 
-@contextlib.contextmanager
-def a_busy_bus(keyed):
-    """Something comes on every key all the time; yields what of strangers' arrives."""
-    accepted: list[str] = []
-    over = threading.Event()
-    with keyed.joined("router_b") as everybody, keyed.joined("bob") as viewer:
-        held = viewer.declare_subscriber("rampart/**", lambda s: accepted.append(
-            str(s.key_expr)) if s.payload.to_bytes() == b"stranger" else None)
-
-        def work():
-            while not over.wait(0.05):
-                for key in KEYS:
-                    everybody.put(f"rampart/{key}", "robot")
-
-        thread = threading.Thread(target=work)
-        thread.start()
-        try:
-            yield accepted
-        finally:
-            over.set()
-            thread.join()
-            del held
-
-
-@needs_root
-def test_another_user_reads_nothing_and_is_not_heard(keyed):
-    with tempfile.TemporaryDirectory(prefix="stranger-", dir="/tmp") as place:
-        Path(place).chmod(0o755)
-        with a_busy_bus(keyed) as accepted:
-            plain = f"tcp/127.0.0.1:{keyed.port}"
-            found = try_all([keyed.at, plain, keyed.socket],
-                            shown_by_strangers(Path(place), keyed.keys), KEYS, becomes_nobody=True)
-        assert found["user"] == 65534
-        assert len(found["tried"]) == 9
-        assert sum(one["heard"] for one in found["tried"].values()) == 0, found
-        assert accepted == []
-
-
-def test_the_same_attempts_succeed_with_a_key(keyed):
-    """So the others fail for want of one; the socket in the folder lets nothing through."""
-    own, ours = str(keyed.keys / "ada.pem"), str(keyed.keys / "ca.crt")
-    with a_busy_bus(keyed) as accepted:
-        assert try_all([keyed.socket], {"nothing": {}}, KEYS)["tried"][
-            f"{keyed.socket} nothing"]["heard"] == 0
-        assert accepted == []
-        found = try_all([keyed.at], {"a key": {
-            "root_ca_certificate": ours, "enable_mtls": True,
-            "connect_private_key": own, "connect_certificate": own}}, KEYS)
-        (one,) = found["tried"].values()
-        assert one["joined"]
-        assert one["heard"] > len(KEYS)
-        assert set(accepted) == {"rampart/" + key for key in (
-            "inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
-            "stub/trigger", "supervisor/signal",
-            "teleoperation/joystick", "way_out/request", "world/actuator_fault",
-            "world/obstacle")}
-
-
 def written(keyed, content, name="own"):
     file = keyed.keys / f"{name}.pem"
     file.write_bytes(content)
     return Credentials(str(keyed.keys / "ca.crt"), str(file), {keyed.socket: keyed.at})
 
 
-def is_let_in(keyed, credentials):
-    """Whether a message on a key that is safety_pilot's arrives from who shows this."""
-    seen: list[bytes] = []
-    with keyed.joined("bob") as viewer:
-        held = viewer.declare_subscriber(
-            "rampart/summit_xl/command", lambda s: seen.append(s.payload.to_bytes()))
+def gets_through(keyed, config):
+    """Whether anything arrives from who joins like this, in safety_pilot's name, and at him."""
+    seen, heard = [], []
+    with keyed.joined("router_b") as everybody, keyed.joined("bob") as viewer:
+        held = viewer.declare_subscriber("rampart/**", lambda s: seen.append(
+            s.key_expr) if s.payload.to_bytes() == b"stranger" else None)
         try:
-            with keyed.joined("", credentials) as session:
+            with opened(config) as session:
+                own = [session.declare_subscriber(key, lambda s: heard.append(
+                    s.key_expr) if s.payload.to_bytes() != b"stranger" else None)
+                    for key in ("**", "rampart/control/command")]
                 end = time.monotonic() + 1.0
-                while time.monotonic() < end and not seen:
-                    session.put("rampart/summit_xl/command", "stranger")
-                    time.sleep(0.02)
+                while time.monotonic() < end and not (seen and heard):
+                    everybody.put("rampart/control/command", "robot")
+                    for key in ("summit_xl/command", "inject/order", "heartbeat/DM4"):
+                        session.put(f"rampart/{key}", "stranger")
+                    heard += [r.ok for r in session.get("rampart/**", timeout=0.1) if r.ok]
+                del own
         except zenoh.ZError:
             pass
         held.undeclare()
-    return bool(seen)
+    return bool(seen), bool(heard)
 
 
 def issued(authority, now=NOW, chain=b""):
@@ -138,16 +72,24 @@ def issued(authority, now=NOW, chain=b""):
                            days=8) + chain
 
 
-@pytest.mark.parametrize(("what", "taken"), [
-    ("of the authority", True), ("expired", False), ("of another authority", False),
-    ("signed by a node", False)])
-def test_only_a_certificate_of_the_authority_that_is_valid_is_let_in(keyed, what, taken):
+@pytest.mark.parametrize("what", [
+    "the authority's", "expired", "of another authority", "signed by a node", "no certificate",
+    "plain TCP", "the socket in the folder"])
+def test_only_a_certificate_of_the_authority_that_is_valid_is_let_in(keyed, what):
     authority, node = ((keyed.keys / name).read_bytes() for name in ("authority.key", "DM4.pem"))
-    made = {"of the authority": lambda: issued(authority),
+    made = {"the authority's": lambda: issued(authority),
             "expired": lambda: issued(authority, NOW - dt.timedelta(days=9)),
             "of another authority": lambda: issued(new_authority(NOW, 9)),
-            "signed by a node": lambda: issued(node, chain=public_part(node))}[what]()
-    assert is_let_in(keyed, written(keyed, made)) == taken
+            "signed by a node": lambda: issued(node, chain=public_part(node))}.get(what)
+    if made is not None:
+        config = session_config((), [keyed.socket], written(keyed, made()))
+    else:
+        config = session_config((), [{
+            "no certificate": keyed.at, "plain TCP": f"tcp/127.0.0.1:{keyed.port}"
+            }.get(what, keyed.socket)])
+        config.insert_json5("transport/link/tls/root_ca_certificate",
+                            json.dumps(str(keyed.keys / "ca.crt")))
+    assert gets_through(keyed, config) == ((what == "the authority's",) * 2)
 
 
 def test_a_link_is_closed_when_its_certificate_expires(keyed):

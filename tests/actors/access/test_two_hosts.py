@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import pytest
 
 from rampart.actors.access import key_folder
@@ -56,39 +54,6 @@ def hosts(tmp_path):
     yield made
     for one in made.kept:
         one.close()
-
-
-@contextlib.contextmanager
-def linked(hosts):
-    with hosts.router(HOSTS[0]) as robot, hosts.router(HOSTS[1], ["router_a"]) as ground:
-        assert wait_for(lambda: list(ground.info.routers_zid()))
-        yield robot, ground
-
-
-def heard_by(session, key):
-    found = []
-    held = session.declare_subscriber(key, lambda s: found.append(s.payload.to_bytes()))
-    return found, held
-
-
-def test_messages_and_questions_cross_both_ways(hosts):
-    with linked(hosts), hosts.client("ftm_manager") as manager, hosts.client("DM5") as module, \
-            hosts.client("teleoperation") as teleoperation:
-        reports, _a = heard_by(manager, "rampart/detection/*")
-        beats, _b = heard_by(module, "rampart/heartbeat/teleoperation")
-
-        def have_crossed():
-            module.put("rampart/detection/DM5", "active")
-            teleoperation.put("rampart/heartbeat/teleoperation", "beat")
-            return b"active" in reports and b"beat" in beats
-
-        assert wait_for(have_crossed)
-    with linked(hosts), hosts.client("hmi") as page, hosts.client("safety_pilot") as pilot:
-        answering = pilot.declare_queryable(
-            "rampart/pilot/status", lambda q: q.reply("rampart/pilot/status", "drives"))
-        assert wait_for(lambda: any(reply.ok is not None for reply in page.get(
-            "rampart/pilot/status", timeout=1.0)))
-        answering.undeclare()
 
 
 def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(hosts):

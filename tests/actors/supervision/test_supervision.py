@@ -163,16 +163,6 @@ async def test_a_loop_that_spins_or_holds_the_lock_is_found_and_replaced(tmp_pat
                          == {("running", 2)}, 20)
 
 
-async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(witness, port):
-    async with witness.comes_back("supervisor", "DM4", "DM5", "RM1"):
-        os.kill(witness.pid("DM5"), signal.SIGSTOP)
-        os.kill(process(port, "supervisor"), signal.SIGKILL)
-        os.kill(witness.pid("DM4"), signal.SIGKILL)  # while no supervisor sees it
-        await eventually(lambda: witness.saw("supervisor", "respawned")
-                         or witness.pid("supervisor") == process(port, "supervisor"))
-        os.kill(witness.pid("RM1"), signal.SIGKILL)
-
-
 async def test_a_node_is_back_while_who_hears_it_is_stopped(witness, port):
     names = ("DM1", "DM2", "DM3", "DM4", "RM2")
     stopped = [process(port, name) for name in names]

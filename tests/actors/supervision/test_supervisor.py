@@ -302,26 +302,6 @@ async def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_proces
     await eventually(lambda: process.killed, 0.3 + 0.2)
 
 
-@within(running)
-async def test_a_process_that_waits_for_a_processor_has_longer_to_start(world):
-    world.machine.starving = {"DM1"}
-    world.machine.starves_from_s = asyncio.get_running_loop().time()
-    add = world.machine.add
-
-    def mute(*named: object) -> Process:
-        process = add(*named)
-        world.silent.add(process.pid)
-        return process
-
-    world.machine.add = mute
-    for name in ("DM1", "DM2"):
-        world.kill(name)
-    await eventually(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
-    assert ("DM1", "wedged", 2) not in world.events
-    world.silent.clear()
-    await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-
-
 def status(world: World, life: int, stamp_s: float | None = None) -> None:
     world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
               "ftm_manager", incarnation=life, stamp_s=stamp_s)
@@ -379,21 +359,6 @@ async def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(wo
     await asyncio.sleep(1.0)
     assert world.machine.forks == [("safety_pilot", 2)]
     assert world.row("safety_pilot")[:2] == ("running", 2)
-
-
-@within(running)
-async def test_a_node_of_a_recovery_module_waits_for_its_request_which_counts_once(world):
-    world.kill("osmosis_control")
-    await asyncio.sleep(1.0)
-    assert world.row("osmosis_control")[:2] == ("crashed", 1)
-    world.respawn("nobody", 1)
-    for _ in range(2):
-        for _ in range(3):
-            world.respawn("osmosis_control", 1)
-        await asyncio.sleep(1.0)
-    assert world.row("osmosis_control")[:2] == ("running", 2)
-    assert world.machine.forks == [("osmosis_control", 2)]
-    assert [event[:2] for event in world.events if event[0] == "nobody"] == [("nobody", "refused")]
 
 
 @within(running)
