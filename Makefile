@@ -61,7 +61,7 @@ chaos: setup
 	$(BIN)/python -m tests.whole.chaos_runs ways
 
 # Hits every pair of processes of the full system, one after the other in long missions; an hour or
-# more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
+# more. Interrupted, it goes on where it was: reports/pairs.jsonl says what is done.
 chaos-pairs: setup
 	$(BIN)/python -m tests.whole.chaos_runs pairs
 
@@ -69,7 +69,7 @@ chaos-pairs: setup
 # Interrupted, it goes on where it was: the same command.
 HOURS ?= 1
 soak: setup
-	$(BIN)/python -m tests.whole.soak_runs --hours $(HOURS)
+	$(BIN)/python -m tests.whole.chaos_runs soak --hours $(HOURS)
 
 # 10,000 generated inputs for each decoder, and a fifth as many series of messages for each actor.
 # RUNS=1000000 makes more, FUZZ="-k '[system]'" chooses a target.

@@ -23,10 +23,17 @@ from tests.whole.chaos import (
     every_pair,
     targets,
 )
-from tests.whole.chaos_runs import Log, load, pairs_in_a_mission, start
+from tests.whole.chaos_runs import (
+    EVERY_S,
+    Log,
+    load,
+    pairs_in_a_mission,
+    plan,
+    start,
+    wrong_in,
+)
 from tests.whole.leak_counts import leaks
 from tests.whole.missions import write_row_mission, write_short_mission
-from tests.whole.soak_runs import EVERY_S, plan, wrong
 
 PAUSE_S = (0.3, 1.0)
 ALL_FOUR = ("mission_manager", "router_a", "safety_pilot", "ftm_manager", "supervisor")
@@ -77,10 +84,10 @@ def test_growth_of_routers_that_change_over_is_found_whatever_the_level_of_each_
         file.write('{"kind": "sam')
     again = Log(tmp_path / "log.jsonl", 1)
     assert again.records == log.records, "after a line that was cut off"
-    assert [line.partition(" by ")[0] for line in wrong(again.records)] == found
+    assert [line.partition(" by ")[0] for line in wrong_in(again.records)] == found
     again.add("hit", mission=0, at_s=2.0, name="hmi", way="STOP", back_s=None)
     again.add("mission", mission=0, safety="unsafe", reasons=["hit a wall"])
-    assert len(wrong(Log(tmp_path / "log.jsonl", 1).records)) == len(found) + 2
+    assert len(wrong_in(Log(tmp_path / "log.jsonl", 1).records)) == len(found) + 2
     with pytest.raises(SystemExit, match="of another seed than 2"):
         Log(tmp_path / "log.jsonl", 2)
 
@@ -111,8 +118,8 @@ def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path, rounds, 
 def test_a_mission_survives_a_dozen_pairs(tmp_path, capsys):
     among = {"supervisor", "router_a", ROOT_PROCESS, "ftm_manager", "osmosis_control",
              "safety_pilot", "mission_manager", "DM4", "RM3", "simulator"}
-    plan = [pair for pair in every_pair(targets(load()), 1) if set(pair.names) <= among][:12]
-    todo = dict(enumerate(plan))
+    chosen = [pair for pair in every_pair(targets(load()), 1) if set(pair.names) <= among][:12]
+    todo = dict(enumerate(chosen))
     log = Log(tmp_path / "pairs.jsonl", 1)
     pairs_in_a_mission(start(tmp_path / "run", write_row_mission(tmp_path), 1.0), todo, log, ("A",))
     printed = capsys.readouterr().out
@@ -129,8 +136,8 @@ def test_a_short_soak_is_safe_and_goes_on_where_it_was(tmp_path):
     file = tmp_path / "log.jsonl"
     for hours, begun in (("0.012", 1), ("0.02", 2)):
         done = subprocess.run(
-            [sys.executable, "-m", "tests.whole.soak_runs", "--hours", hours, "--laps", "0",
-             "--file", str(file)], check=False, capture_output=True, text=True, cwd=ROOT)
+            [sys.executable, "-m", "tests.whole.chaos_runs", "soak", "--hours", hours, "--laps",
+             "0", "--file", str(file)], check=False, capture_output=True, text=True, cwd=ROOT)
         records = [json.loads(line) for line in file.read_text().splitlines()]
         assert done.returncode == 0, done.stdout + done.stderr
         assert sum(r["kind"] == "begin" for r in records) == begun

@@ -62,13 +62,8 @@ DECLARED = f"""{PLAIN}
         highest_m: float = 2.0
 """
 BROKEN = {
-    "syntax": ("class Level(:\n", "", "SyntaxError: invalid syntax (own.py, line 1)"),
     "raises": ("import os\n\nraise RuntimeError('no hardware')\n", "",
                "RuntimeError: no hardware (HERE/own.py, line 3)"),
-    "absent": ("import no_such_thing\n", "",
-               "No module named 'no_such_thing'"),
-    "none declared": (f"{PLAIN}    pass\n", "highest_m = 1", "parameters.highest_m = 1: unknown "
-                      "field; known: none"),
     "wrong type": (DECLARED, 'highest_m = "x"', "parameters.highest_m = 'x': expected a number"),
     "no struct": (f"{PLAIN}    class Parameters:\n        highest_m = 2.0\n", "highest_m = 1",
                   "actor = 'own:Level': Parameters: "),

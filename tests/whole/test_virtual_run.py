@@ -177,15 +177,6 @@ def test_killed_detection_modules_know_the_state_again_before_their_silence_coun
     assert (result.success, result.safe, decisions(result)) == (True, True, [])
 
 
-def test_killed_guards_come_back_and_the_mission_goes_on(near):
-    record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
-                               "kill:supervisor@18", "kill:graph_planner@18.01",
-                               options=near)).record
-    assert (record.mission, record.safety) == ("success", "safe")
-    assert record.restarts == {"supervisor": 2, "ftm_manager": 1, "safety_pilot": 1,
-                               "graph_planner": 1}
-
-
 def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(near):
     record = run_virtually(job("stop:all@10+30", system="osmosis", options=near)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
