@@ -31,8 +31,8 @@ def net():
 LINKED_S = 5.0
 """Until then all routers are linked to each other again, and no detour is in use."""
 
-FLAPPED_S = 10.0
-"""A host that was lost again so soon is back after so many seconds, then after twice as many."""
+FLAPPED_S = 20.0
+"""A host that was lost again so soon is back after up to so many seconds more."""
 
 
 def has(run: RealRun, nodes: tuple[str, ...], *, run_here: bool, within_s: float = 15.0) -> None:
@@ -83,19 +83,13 @@ def test_each_may_lose_each(net, tmp_path: Path):
         desk.process.send_signal(signal.SIGKILL)
         has(robot, ON_DESK, run_here=True)
         has(ground, ON_GROUND, run_here=True)
-        with host(net, "desk", tmp_path / "again", spec, "--no-keys") as again:
-            again.wait_for("takes part in run")
-            has(robot, ON_DESK, run_here=False)
-            has(again, ON_DESK, run_here=True)
-            net.line = Line(is_cut=True)
-            has(robot, ON_GROUND + ON_DESK, run_here=True)
-            net.line = Line(**BAD)
-            has(robot, ON_GROUND + ON_DESK, run_here=False, within_s=15 + 2 * FLAPPED_S)
-            has(ground, ON_GROUND, run_here=True)
-            has(again, ON_DESK, run_here=True)
-            time.sleep(1.0)
-            robot.process.send_signal(signal.SIGINT)
-            assert robot.result(20)[0] == 0
-            assert again.result(20)[0] == 0
+        net.line = Line(is_cut=True)
+        has(robot, ON_GROUND + ON_DESK, run_here=True)
+        net.line = Line(**BAD)
+        has(robot, ON_GROUND, run_here=False, within_s=15 + FLAPPED_S)
+        has(ground, ON_GROUND, run_here=True)
+        time.sleep(1.0)
+        robot.process.send_signal(signal.SIGINT)
+        assert robot.result(20)[0] == 0
         assert ground.result(20)[0] == 0
     assert not [line for line in robot.story.splitlines() if "failed" in line]

@@ -141,7 +141,7 @@ NO_PROCESSES = [pytest.param(
      "prlimit", f"--nproc={processes}"], "", id=f"{processes} processes",
     marks=pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
                              reason="only root can be a user who may start no process"))
-    for processes in (1, 12, 60)]
+    for processes in (1, 3, 60)]
 NO_FILES = pytest.param(
     ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh"],
     f"the hard limit is 64, and 23 processes need {needed_of(resource.RLIMIT_NOFILE, 23)}",
