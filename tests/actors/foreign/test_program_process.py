@@ -1,4 +1,4 @@
-"""A program as the process of its node holds it: started, ended, and what it has forked."""
+"""A program as the process of its node holds it: started, heard, ended, and what it has forked."""
 
 from __future__ import annotations
 
@@ -7,23 +7,28 @@ import functools
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Coroutine
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 
+from rampart.actors.foreign import output_log
 from rampart.actors.foreign.descendants import descendants, is_below, kill_all
-from rampart.actors.foreign.output_log import OutputLog
+from rampart.actors.foreign.output_log import BURST_BYTES, OutputLog
+from rampart.actors.foreign.program import inherited_environment
 from rampart.actors.foreign.program_process import ProgramProcess
-from rampart.actors.foreign.pulse import NotifySocket
+from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
 from rampart.testing import eventually, wait_until
+from tests import ROOT
 
 FORKS = """
 setsid sh -c 'trap "" TERM; while :; do sleep 600; done' &
@@ -220,3 +225,170 @@ def test_a_datagram_of_a_living_descendant_counts_and_no_other():
         gone.stdin.close()
     assert len(refused) == 2
     notify.close()
+
+
+def test_a_path_of_python_is_inherited_unless_it_leads_to_this_rampart(monkeypatch):
+    ros = "/opt/ros/jazzy/lib/python3.12/site-packages"
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), ros]))
+    assert inherited_environment()["PYTHONPATH"] == ros
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    assert "PYTHONPATH" not in inherited_environment()
+    monkeypatch.delenv("PYTHONPATH")
+    assert inherited_environment() == dict(os.environ)
+
+
+def test_silence_counts_from_the_last_beat_and_what_it_says_itself_at_once():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    pulse.beat()
+    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    pulse.beat()
+    assert pulse.is_well(0.8)
+    pulse.trigger()
+    assert not pulse.is_well(0.8)
+
+
+def test_the_first_beat_may_come_later():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    assert [pulse.is_well(n / 10) for n in (0, 10, 20)] == [True] * 3
+    wells = [pulse.is_well(2.0 + n / 10) for n in range(60)]
+    assert wells[40]
+    assert not wells[-1]
+
+
+def test_time_in_which_the_node_itself_stood_still_does_not_count():
+    pulse = Pulse(timeout_s=0.5, first_s=0.5, look_s=0.2)
+    pulse.beat()
+    assert pulse.is_well(0.0)
+    assert pulse.is_well(60.0)
+    assert pulse.is_well(60.1)
+    assert not any(pulse.is_well(60.0 + n / 10) for n in range(5, 10))
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_it_may_ask_for_more_time_until_its_next_beat(started):
+    pulse = Pulse(timeout_s=0.5, first_s=1.0, look_s=0.2)
+    if started:
+        pulse.beat()
+    pulse.extend(3.0)
+    wells = [pulse.is_well(n / 10) for n in range(40)]
+    assert wells == [True] * 31 + [False] * 9
+    pulse.beat()
+    assert [pulse.is_well(4.0 + n / 10) for n in range(8)][-1] is False, "the usual time again"
+
+
+def test_silence_does_not_count_while_a_carrier_is_down_and_starts_again_after_its_restart():
+    pulse = Pulse(timeout_s=0.5, first_s=1.0, look_s=0.2, carriers=("gateway",))
+    pulse.beat()
+    pulse.note_process("gateway", "crashed")
+    pulse.beat()  # which shows that it works, though its event was lost
+    pulse.note_process("other", "crashed")
+    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    pulse.beat()
+    for failure in ("wedged", "crashed", "given up"):
+        pulse.note_process("gateway", failure)
+    assert all(pulse.is_well(1.0 + n / 10) for n in range(50))
+    pulse.restart()  # of the program
+    assert all(pulse.is_well(6.0 + n / 10) for n in range(50))
+    pulse.note_process("gateway", "respawned")
+    wells = [pulse.is_well(11.0 + n / 10) for n in range(13)]
+    assert wells[:10] == [True] * 10
+    assert wells[-2:] == [False] * 2
+
+
+def test_one_that_says_that_it_ends_has_to_end():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    pulse.stopping()
+    wells = []
+    for n in range(10):
+        pulse.beat()
+        wells.append(pulse.is_well(n / 10))
+    assert wells[:5] == [True] * 5
+    assert not wells[-1]
+
+
+@pytest.mark.parametrize(("text", "seconds"), [
+    ("5000000", 5.0), ("0", 0.0), ("3600000001", 3600.0), ("9" * 6000, 3600.0),
+    ("0" * 7000 + "1000000", 1.0), ("", None), ("-1", None), (" 1", None), ("1e6", None),
+    ("1_000", None), ("nan", None), ("\u0663", None)])
+def test_how_much_time_it_asks_for(text, seconds):
+    assert extension_s(text) == seconds
+
+
+def test_assignments_come_in_order_several_in_a_datagram_and_a_flood_in_parts():
+    notify = NotifySocket("wheels", lambda *_: None)
+    assert notify.name.startswith("@")
+    assert notify.take() == []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as command:
+        for said in (b"READY=1\nSTATUS=up", b"\xff", b"", b"WATCHDOG=1"):
+            command.sendto(said, f"\0{notify.name[1:]}")
+        assert notify.take() == ["READY=1", "STATUS=up", "\ufffd", "WATCHDOG=1"]
+        for _ in range(8):
+            command.sendto(b"WATCHDOG=1", f"\0{notify.name[1:]}")
+    assert [len(notify.take(most=5)) for _ in range(2)] == [5, 3]
+    notify.close()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr(output_log.time, "monotonic", lambda: now_s[0])
+    return now_s
+
+
+def test_output_goes_on_in_a_second_file_and_never_beyond(tmp_path, clock):
+    file, before = tmp_path / "a.log", tmp_path / "a.log.1"
+    file.write_bytes(b"x" * 950)
+    log = OutputLog(file, most=1000)
+    log.write(b"new\n" * 20)
+    assert before.read_bytes() == b"x" * 950, "of the incarnation before"
+    for number in range(100):
+        clock[0] += 1.0
+        log.write(b"%09d\n" % number * 10)
+        assert file.stat().st_size <= 1000
+    assert before.stat().st_size <= 1000
+    assert {entry.name for entry in tmp_path.iterdir()} == {"a.log", "a.log.1"}
+    assert (before.read_bytes() + file.read_bytes()).endswith(b"000000099\n")
+    assert b"000000090\n" in before.read_bytes() + file.read_bytes()
+
+
+def test_there_is_a_file_of_its_name_at_any_moment(tmp_path, clock, monkeypatch):
+    file = tmp_path / "a.log"
+    log = OutputLog(file, most=100)
+    seen = []
+
+    def watched(real, *given):
+        seen.append(file.exists())
+        done = real(*given)
+        seen.append(file.exists())
+        return done
+
+    for name in ("unlink", "link", "replace", "open"):
+        monkeypatch.setattr(output_log.os, name, partial(watched, getattr(os, name)))
+    log.write(b"x" * 60)
+    seen.clear()
+    for _ in range(5):
+        log.write(b"x" * 60)
+    assert seen
+    assert all(seen)
+
+
+def test_a_flood_is_counted_where_it_is_too_much_and_the_count_is_told(tmp_path, clock):
+    file = tmp_path / "a.log"
+    log = OutputLog(file)
+    for _ in range(100):
+        log.write(b"x" * 65_536)
+    kept = file.stat().st_size
+    assert kept <= BURST_BYTES
+    clock[0] += 1.0
+    log.write(b"y\n")
+    left_out = 100 * 65_536 - kept
+    assert file.read_bytes()[kept:] == f"\n--- {left_out} bytes are left out\ny\n".encode()
+
+
+def test_no_folder_and_a_link_in_the_place_of_the_log_end_nothing(tmp_path):
+    OutputLog(tmp_path / "none" / "a.log").write(b"lost\n")
+    target = tmp_path / "precious"
+    target.write_text("mine")
+    (tmp_path / "a.log").symlink_to(target)
+    OutputLog(tmp_path / "a.log").write(b"lost\n")
+    assert target.read_text() == "mine"

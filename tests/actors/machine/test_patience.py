@@ -1,4 +1,4 @@
-"""Who hangs and who merely waits for a processor, in the kernel's figures, second by second."""
+"""Who hangs and who merely waits for a processor, who was absent, and what each uses."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
+import psutil
 import pytest
 
+from rampart.actors.machine.absence import ABSENT_S, GRACE_S, Absence
 from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage, usage
+from rampart.actors.machine.process_usage import ProcessCount, UsageMeter, read_count
 from rampart.testing import wait_until
 
 
@@ -98,3 +102,64 @@ def test_the_kernel_tells_who_runs_and_who_is_stopped():
         child.wait()
     assert usage(child.pid) == Usage("X", 0.0, 0.0)
     assert usage(os.getpid()).state == "R"
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_one_that_was_stopped_is_excused_for_a_grace_in_real_seconds_that_covers_the_others(rate):
+    absence, grace_s = Absence(0.0, rate=rate), rate * GRACE_S
+    assert [absence.note(0.2 * n) for n in range(1, 50)] == [0.0] * 49
+    assert not absence.excuses(9.8)
+    assert absence.note(39.8) == pytest.approx(30.0)
+    assert absence.excuses(39.8 + 0.9 * grace_s)
+    assert not absence.excuses(39.8 + grace_s)
+
+
+def test_one_that_is_always_late_is_not_always_excused():
+    absence, now_s, excused = Absence(0.0), 0.0, 0
+    for _ in range(100):
+        now_s += ABSENT_S + 0.05
+        absence.note(now_s)
+        excused += absence.excuses(now_s)
+    assert 0 < excused < 50
+
+
+def test_this_process_is_as_psutil_sees_it():
+    count, other = read_count(os.getpid()), psutil.Process()
+    assert count is not None
+    assert count.memory_bytes == pytest.approx(other.memory_info().rss, rel=0.2)
+    assert count.cpu_s == pytest.approx(sum(other.cpu_times()[:2]), abs=1.0)
+
+
+def test_a_name_with_parentheses_and_spaces_does_not_shift_the_fields(tmp_path):
+    program = tmp_path / "a) S (b"
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([program, "60"]) as process:
+        count = read_count(process.pid)
+        process.kill()
+    assert count is not None
+    assert 0 <= time.clock_gettime(time.CLOCK_BOOTTIME) - count.started_s < 60
+
+
+def test_a_process_that_has_ended_is_left_out():
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert read_count(ended.pid) is None
+    assert UsageMeter().look([ended.pid, 0, -5]) == {}
+
+
+def test_the_share_is_over_the_whole_life_at_first_and_then_since_the_look_before():
+    now_s, count = 100.0, ProcessCount(5.0, 1000, 90.0)
+    meter = UsageMeter(lambda _pid: count, lambda: now_s)
+
+    def share() -> float:
+        return meter.look([7])[7].cpu_share
+
+    assert (share(), share()) == (0.5, 0.0), "not divided by no time"
+    now_s, count = 104.0, ProcessCount(6.0, 1000, 90.0)
+    assert share() == 0.25
+    assert meter.look([7])[7].age_s == 14.0
+    now_s, count = 108.0, ProcessCount(1.0, 1000, 106.0)
+    assert share() == 0.5, "the pid is used again, by another process"
+    meter.look([])
+    now_s = 110.0
+    assert share() == 0.25, "it was forgotten, as nobody asked for it"

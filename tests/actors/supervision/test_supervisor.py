@@ -8,6 +8,8 @@ import errno
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
+from itertools import pairwise
 
 import msgspec
 import pytest
@@ -15,19 +17,42 @@ import pytest
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
 from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.detection.freshness import Freshness
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
-from rampart.actors.machine.patience import Usage
+from rampart.actors.ftm.messages import (
+    AdaptedSystem,
+    ManagerStatus,
+    NodeState,
+    ProgramEnd,
+    RespawnRequest,
+)
+from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.supervision.processes import Answer, ProcessHandle, RunProcess
-from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
-from rampart.actors.system.layout import Layout
-from rampart.manager.spec.nodes import Kind, NodeSpec
+from rampart.actors.supervision.supervised_process import (
+    MOST_EXCUSED_S,
+    START_TIMEOUT_S,
+    STATUS,
+    Event,
+    Lives,
+    RestartPolicy,
+    State,
+    SupervisedProcess,
+)
+from rampart.actors.system.layout import Layout, Unit
+from rampart.manager.actor import FtmManager
+from rampart.manager.spec.adaptation import Action, Change, adapt
+from rampart.manager.spec.nodes import Kind, NodeSpec, RestartLimits
 from rampart.manager.spec.tables import Supervision
+from rampart.sim.campaign.job import Job, run_virtually
+from rampart.sim.faults.scenario import parse_fault
 from rampart.testing import VirtualSystem, eventually, turns
 from tests import ROOT
 from tests.virtual_time import within
+from tests.whole.missions import write_short_mission
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
 USUAL = Supervision()
@@ -425,3 +450,374 @@ async def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_e
     higher = max(two, key=lambda p: p.incarnation)
     assert world.row("DM2") == ("running", 7, higher.pid)
     assert world.machine.of("DM2") == [higher]
+
+
+OWN, ARBITRATED = "of_supervisor", "of_RM4"
+"""Restarted by the supervisor itself, and on the request of a recovery module."""
+
+restarted, arbitrated = (partial(running, commands=[one]) for one in ("supervisor", "RM4"))
+
+REASON = "./it ended: exit code 3"
+
+
+class Node:
+    """The process of a command's node, which starts its program when it reads "respawned"."""
+
+    def __init__(self, world: World, name: str) -> None:
+        self.world, self.name = world, name
+        (self.process,) = world.machine.of(name)
+        self.is_deaf = False
+        self.starts: list[int] = []
+        world.hub.taps.append(self._see)
+
+    def end_program(self) -> None:
+        """Report the end of its program."""
+        self.world.silent.add(self.process.pid)
+        self.world.say(topics.PROGRAM_END, ProgramEnd(self.process.pid, REASON),
+                       self.name, incarnation=self.process.incarnation)
+
+    def _see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
+        if key != topics.PROCESS_EVENT.at() or self.is_deaf:
+            return
+        event = decode(topics.PROCESS_EVENT, payload)[1]
+        if (event.node, event.event, event.pid) == (self.name, "respawned", self.process.pid) \
+                and event.incarnation > self.process.incarnation:
+            self.process.incarnation = event.incarnation
+            self.world.machine.issued[self.name] = event.incarnation
+            self.starts.append(event.incarnation)
+            self.world.silent.discard(self.process.pid)
+
+
+@within(restarted)
+async def test_a_program_that_ends_is_the_next_incarnation_in_the_same_process_at_once(world):
+    node, tables = Node(world, OWN), []
+    world.hub.taps.append(lambda _now, _source, key, payload: tables.append(
+        decode(topics.NODES, payload)[1]) if key == topics.NODES.at() else None)
+    for incarnation in (2, 3):
+        world.events.clear()
+        node.end_program()
+        await eventually(lambda n=incarnation: node.starts[-1:] == [n], 0.01)
+        await eventually(lambda n=incarnation: world.row(OWN) == (
+            "running", n, node.process.pid))
+        assert [event for name, event, _ in world.events if name == OWN] == [
+            "crashed", "respawned", "running"]
+    assert world.machine.forks == []
+    assert not node.process.killed
+    rows = {row.name: row for row in tables[-1].nodes}
+    assert (rows[OWN].incarnation, rows[OWN].restarts) == (3, 2)
+
+
+@within(arbitrated)
+async def test_a_node_of_a_recovery_module_waits_for_its_request(world):
+    node = Node(world, ARBITRATED)
+    node.end_program()
+    for _ in range(20):  # it repeats that
+        await asyncio.sleep(0.1)
+        node.end_program()
+    assert node.starts == []
+    assert world.row(ARBITRATED)[0] == "crashed"
+    world.respawn(ARBITRATED, 1)
+    await eventually(lambda: world.row(ARBITRATED) == ("running", 2, node.process.pid))
+    assert node.starts == [2]
+    assert world.machine.forks == []
+    assert [event for event in world.events if event[1] == "crashed"] == [
+        (ARBITRATED, "crashed", 1)]
+
+
+@within(arbitrated)
+async def test_a_process_that_dies_while_its_program_is_down_is_replaced(world):
+    node = Node(world, ARBITRATED)
+    node.end_program()
+    await asyncio.sleep(0.1)
+    world.kill(ARBITRATED)
+    await asyncio.sleep(0.1)
+    assert world.machine.forks == []
+    world.respawn(ARBITRATED, 1)
+    await eventually(lambda: world.row(ARBITRATED)[:2] == ("running", 2))
+    assert world.machine.forks == [(ARBITRATED, 2)]
+
+
+@within(restarted)
+async def test_a_node_that_has_missed_its_respawn_reads_it_when_it_reports_again(world):
+    node = Node(world, OWN)
+    node.is_deaf = True
+    node.end_program()
+    await asyncio.sleep(0.2)
+    node.is_deaf = False
+    node.end_program()
+    await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
+    assert node.starts == [2]
+
+
+@within(restarted)
+async def test_a_node_that_does_not_start_its_program_is_replaced(world):
+    node = Node(world, OWN)
+    node.is_deaf = True
+    node.end_program()
+    await eventually(lambda: world.row(OWN)[:2] == ("running", 3), 10.0)
+    assert node.process.killed
+    assert world.machine.forks == [(OWN, 3)]
+
+
+@within(restarted)
+async def test_a_new_supervisor_takes_the_end_from_its_repetition(world):
+    node = Node(world, OWN)
+    await world.replace_supervisor(node.end_program, **{OWN: 1})
+    await asyncio.sleep(0.1)
+    node.end_program()
+    await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
+    assert world.machine.forks == []
+
+
+@within(restarted)
+async def test_the_end_of_another_process_or_from_a_stranger_is_nothing(world):
+    node = Node(world, OWN)
+    for pid, source in ((999_999, OWN), (node.process.pid, "tester")):
+        world.say(topics.PROGRAM_END, ProgramEnd(pid, REASON), source)
+        await asyncio.sleep(0.1)
+    assert world.row(OWN) == ("running", 1, node.process.pid)
+    assert node.starts == []
+
+
+SICK_S = (14.0, 40.0)
+"""Simulated seconds, far longer than it takes to be given up."""
+
+SOON = Supervision(intensity=8, period_s=6.0, backoff_max_s=0.2, attempt_s=1.0, attempt_max_s=4.0)
+"""A supervisor that gives up sooner than the usual one."""
+
+
+class Sick(Actor):
+    """Fails whenever it starts, for a while, and is well after it."""
+
+    def on_start(self) -> None:
+        if SICK_S[0] <= self.clock.now() < SICK_S[1]:
+            raise RuntimeError("sick")
+        super().on_start()
+
+
+class SickPilot(Sick, SafetyPilot):
+    pass
+
+
+class SickModule(Sick, Freshness):
+    pass
+
+
+class SickManager(Sick, FtmManager):
+    pass
+
+
+def restarts_of(
+    policy: RestartPolicy, until_s: float, lasts_s: float = 0.0
+) -> list[tuple[float, bool]]:
+    """Return when a process that always lasts so long is restarted, and whether by an attempt."""
+    now_s, restarts = 0.0, []
+    while now_s < until_s:
+        delay_s = policy.delay_s(now_s)
+        is_attempt = delay_s is None
+        now_s += policy.attempt_in_s(now_s) if delay_s is None else delay_s
+        policy.restarted(now_s)
+        restarts.append((now_s, is_attempt))
+        now_s += lasts_s
+    return restarts
+
+
+def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_apart():
+    restarts = restarts_of(RestartPolicy(), 24 * 3600)
+    free = [at_s for at_s, is_attempt in restarts if not is_attempt]
+    attempts = [at_s for at_s, is_attempt in restarts if is_attempt]
+    assert len(free) == 50
+    assert attempts[0] == pytest.approx(free[0] + 60)
+    gaps = [b - a for a, b in pairwise(attempts)]
+    assert gaps[:4] == [20.0, 40.0, 60.0, 60.0]
+    assert set(gaps[2:]) == {60.0}
+    assert len(attempts) > 24 * 60 - 5  # for as long as the run lasts
+    at_s = [restart for restart, _ in restarts]
+    assert all(at_s[i + 50] - at_s[i] >= 60 for i in range(len(at_s) - 50))
+    policy = RestartPolicy()  # who lasts for a whole period is as good as any other again
+    restarts_of(policy, 100)
+    assert policy.attempts
+    policy.restarted(200)
+    assert policy.delay_s(259) is None
+    assert policy.delay_s(260.1) == 0.0
+    assert policy.attempts == 0
+
+
+@pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
+@within(partial(running, SOON))
+async def test_a_process_that_fails_at_its_start_is_given_up_and_tried_again(world, name):
+    world.machine.sick.add(name)
+    world.kill(name)
+    await asyncio.sleep(0.02)
+    world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
+    await eventually(lambda: world.row(name)[0] == "given up", 20)
+    await asyncio.sleep(0.01)
+    given_up_s, forks = world.clock.now(), len(world.machine.forks)
+    assert forks == 8
+    asked = len(world.events)
+    world.respawn(name, 2)  # whoever asks meanwhile is answered, and gets no process
+    await asyncio.sleep(0.05)
+    assert (name, "given up", world.row(name)[1]) in world.events[asked:]
+    next_s = next(row.next_attempt_s for row in world.supervisor.rows() if row.name == name)
+    await asyncio.sleep(next_s - world.clock.now() - 0.01)
+    assert len(world.machine.forks) == forks
+    await asyncio.sleep(0.03)
+    assert len(world.machine.forks) == forks + 1
+    await asyncio.sleep(given_up_s + 60 - world.clock.now())
+    attempts = len(world.machine.forks) - forks
+    assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
+    assert world.row(name)[0] == "given up"
+    world.machine.sick.clear()
+    await eventually(lambda: world.row(name)[0] == "running", 10)
+    assert len(world.machine.of(name)) == 1
+    await asyncio.sleep(10)
+    world.kill(name)  # it is like any other again
+    await asyncio.sleep(0.02)
+    world.respawn(name, world.row(name)[1])
+    await eventually(lambda: world.row(name)[0] == "running", 0.2)
+
+
+SHORT = Supervision()
+SLOW = Supervision(intensity=3, period_s=60)
+"""Three restarts within a minute are too many; a process is well after ten minutes."""
+
+
+@pytest.mark.parametrize(("limits", "works", "present_s", "failing"), [
+    (SHORT, [0.1] * 3, 0.0, True), (SHORT, [0.1] * 3, 1.1, False), (SHORT, [0.1] * 2, 0.0, False),
+    (SHORT, [1.3] * 20, 1.3, True), (SHORT, [1.3] * 20, 10.1, False),
+    (SHORT, [2.9] * 9, 0.1, False), (SHORT, [1.3] * 20 + [12.0] + [1.3] * 9, 0.0, False),
+    (SHORT, [300.0] + [9.9] * 20, 0.0, True),
+    (SLOW, [70.0] * 3, 0.0, True), (SLOW, [70.0] * 2, 0.0, False), (SLOW, [70.0] * 3, 599.0, True),
+    (SLOW, [70.0] * 3, 600.0, False), (SLOW, [70.0, 70.0, 601.0, 70.0], 0.0, False),
+    (SLOW, [900.0] * 40, 0.0, False)])  # killed four times an hour
+def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
+        limits, works, present_s, failing):
+    one, now_s = Lives(limits), 0.0
+    for worked_s in works:
+        one.forked()
+        now_s += 9.0  # a cold start of nine seconds counts for nothing
+        one.worked(now_s)
+        now_s += worked_s
+        assert one.ended(now_s)
+        assert not one.ended(now_s)
+    one.forked()
+    one.worked(now_s)
+    assert one.failing(now_s + present_s) == failing
+
+
+def test_a_node_may_have_limits_of_its_own():
+    general = Supervision(intensity=50, attempt_s=10.0, attempt_max_s=60.0)
+    limits = RestartLimits(intensity=3, at_most_s=5.0).within(general)
+    assert (limits.intensity, limits.period_s, limits.backoff_s) == (3, 60.0, 0.05)
+    assert (limits.backoff_max_s, limits.attempt_s, limits.attempt_max_s) == (5.0, 5.0, 5.0)
+    assert RestartLimits().within(general) == general
+
+
+@within(partial(running, Supervision(intensity=3, period_s=20.0)))
+async def test_an_unstable_node_is_reported_at_each_end_and_restarted_without_a_request(world):
+    """No recovery module requests it any more: its own has failed, and a safer one acts."""
+    for incarnation in range(1, 4):
+        await asyncio.sleep(25.0)
+        assert world.failing == set()
+        world.kill("osmosis_control")  # of RM3
+        await asyncio.sleep(0.02)
+        world.respawn("osmosis_control", incarnation)
+        await eventually(lambda: world.row("osmosis_control")[0] == "running", 1)
+    await asyncio.sleep(25.0)
+    assert world.failing == {"osmosis_control"}
+    world.kill("osmosis_control")
+    await asyncio.sleep(1.0)
+    assert world.row("osmosis_control")[:2] == ("running", 5)
+    told = [event for node, event, _ in world.events if node == "osmosis_control"]
+    assert told.count("unstable") == 2
+    await asyncio.sleep(199.0)
+    assert world.failing == {"osmosis_control"}
+    await asyncio.sleep(2.0)
+    assert world.failing == set()
+    assert [event for node, event, _ in world.events if node == "osmosis_control"][-1] == "stable"
+
+
+@within(partial(running, SOON))
+async def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(world):
+    process = world.supervisor._processes["DM2"]
+    for _ in range(20):
+        process.policy.restarted(asyncio.get_running_loop().time())
+    world.kill("DM2")
+    await eventually(lambda: world.row("DM2")[0] == "given up")
+    document, _ = adapt(load_document(PLAN), Change(
+        Action.RETUNE, "DM2", {"timeout_s": 0.995}), PLAN.system_file)
+    world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+        2, "retune DM2", "somebody", msgspec.json.encode(document).decode()))
+    await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
+
+
+@pytest.mark.parametrize(("node", "sick"), [
+    ("safety_pilot", SickPilot),
+    pytest.param("DM2", SickModule, marks=pytest.mark.nightly),
+    pytest.param("ftm_manager", SickManager, marks=pytest.mark.nightly)])
+def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(tmp_path, node, sick):
+    usual = sick.__mro__[2]
+    soon = "".join(f"{name} = {value}\n" for name, value in msgspec.structs.asdict(SOON).items())
+    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
+    file = tmp_path / "sick.toml"
+    file.write_text(text.replace(
+        f'"{usual.__module__}:{usual.__name__}"', f'"{__name__}:{sick.__name__}"', 1)
+        + f"\n[supervision]\n{soon}", encoding="utf-8")
+    result = run_virtually(Job(
+        row="x", system=str(file), patience_s=120,
+        options={"mission": str(write_short_mission(tmp_path))},
+        faults=(parse_fault(f"kill:{node}@15"),)))
+    record = result.record
+    assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
+    given_up = [e.t_s for e in record.events if f"{node} given up" in e.text]
+    assert len(given_up) >= 3
+    assert {name for name, _ in result.failures} == {node}
+    stands_s = given_up[0] + 3.0  # silence is noticed after 0.99 s, and then it brakes
+    assert [at for at in record.track if stands_s < at[0] < SICK_S[1]] == []
+
+
+def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
+    unit = Unit("a", (NodeSpec("a", Kind.CONTROL, "m:A"), NodeSpec("b", Kind.CONTROL, "m:B")))
+    made = SupervisedProcess(unit, RestartPolicy(Supervision(**limits)), Patience(0.2), state)
+    if state is not State.RESTARTING:
+        made.shown = NodeState(state.value)
+    return made
+
+
+@pytest.mark.parametrize(("before", "shown"), [
+    (State.STARTING, "crashed"), (State.RUNNING, "crashed"), (State.STOPPED, "stopped"),
+    (State.WEDGED, "wedged"), (State.CRASHED, "crashed")])
+def test_one_that_is_being_restarted_is_shown_as_what_it_was_and_never_as_well(before, shown):
+    one = process(before)
+    one.step(Event.RESTART)
+    assert (one.state, one.shown.value, one.waits) == (State.RESTARTING, shown, True)
+    assert one.is_dead == (shown == "crashed")
+
+
+def silence(one: SupervisedProcess, now_s: float) -> str:
+    return one.silence(now_s, 1.0, lambda: AT_LEISURE)
+
+
+def test_a_new_process_is_silent_when_it_was_not_heard_for_as_long_as_it_may_take():
+    one = process(State.STARTING)
+    one.take(7, 1)
+    assert silence(one, START_TIMEOUT_S - 0.1) == ""
+    assert silence(one, START_TIMEOUT_S + 0.1) == "no heartbeat after its start"
+
+
+@pytest.mark.parametrize(("heard_s", "expected", "excused"), [
+    ({"a": 8.0, "b": 10.0}, "no heartbeat from a", ""),
+    ({"a": 8.0, "b": 8.0, STATUS: 8.0}, "no heartbeat from a, b", ""),
+    ({"a": 10.0, "b": 10.0, STATUS: 8.0}, f"no {STATUS}", ""),
+    ({"a": 7.0, "b": 10.0}, "no heartbeat from a", "no heartbeat from a"),
+    ({"a": 9.5, "b": 10.0}, "", ""), ({}, "", "")])
+def test_each_node_has_to_be_heard_and_the_manager_s_status_unless_it_could_not_be(
+        heard_s, expected, excused):
+    one = process(State.RUNNING)
+    one.take(7, 1)
+    one.heard_s = heard_s
+    assert silence(one, 10.0) == expected
+    one.excuse(10.0, 1.5)  # the supervisor could not hear for so long
+    assert silence(one, 10.0) == excused
+    one.take(8, 3)
+    assert silence(one, 10.0) == "", "another process"
