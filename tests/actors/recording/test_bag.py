@@ -205,23 +205,20 @@ def test_the_robot_is_as_large_as_the_system_says(tmp_path, text, size):
 
 
 def test_the_log_tells_decisions_detections_and_processes_once_each():
-    views = OsmosisViews()
-    header = Header("ftm_manager", 1, 4, 0.0)
+    views, header = OsmosisViews(), Header("ftm_manager", 1, 4, 0.0)
     decision = fm.DecisionRecord(3, "safety-first", ("FTM1",), 1, ("RM1",), (), (), 0.0)
-    lines = [view for _ in range(2)
-             for view in views.of(ftm_topics.DECISION, "d", header, decision, 0)]
-    assert [line.message for _, line in lines] == [
-        "decision 3: RM1: FTM1, because it is the only active mechanism (block 1)."]
-    states = [fm.DetectionState.IDLE, fm.DetectionState.ACTIVE, fm.DetectionState.ACTIVE,
-              fm.DetectionState.IDLE]
-    told = [line.message for number, state in enumerate(states) for _, line in views.of(
-        ftm_topics.DETECTION, "DM1", Header("DM1", 1, number, 0.0),
-        fm.DetectionReport(state, "fence", (), 0.0), 0)]
-    assert told == ["DM1: fence", "DM1: clear"]
+    reports = [fm.DetectionReport(state, "fence", (), 0.0) for state in (
+        fm.DetectionState.IDLE, *[fm.DetectionState.ACTIVE] * 2, fm.DetectionState.IDLE)]
     died = fm.ProcessEvent("hmi", "crashed", 1, 1, "", "killed by SIGKILL")
-    [(_, line)] = views.of(ftm_topics.PROCESS_EVENT, "e", header, died, 0)
-    assert (line.level, line.message) == (
-        fg.LogLevel.WARNING, "hmi crashed, incarnation 1: killed by SIGKILL")
+    told = [line for topic, body in (
+        *[(ftm_topics.DECISION, decision)] * 2, *((ftm_topics.DETECTION, one) for one in reports),
+        (ftm_topics.PROCESS_EVENT, died))
+        for _, line in views.of(topic, topic.key, header, body, 0)]
+    assert [line.message for line in told] == [
+        "decision 3: RM1: FTM1, because it is the only active mechanism (block 1).",
+        "ftm_manager: fence", "ftm_manager: clear",
+        "hmi crashed, incarnation 1: killed by SIGKILL"]
+    assert told[-1].level == fg.LogLevel.WARNING
 
 
 def test_every_view_is_of_the_type_that_its_channel_announces(recording):

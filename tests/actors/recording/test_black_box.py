@@ -274,15 +274,6 @@ def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
     box.writer.abandon()
 
 
-def test_a_wall_clock_that_jumps_back_disorders_nothing(box):
-    box.second(0.0, decision(1, 0.5))
-    box.seconds(1, 40)
-    box.now -= 3600
-    box.second(100.0, decision(2, 100.5))
-    box.seconds(101, 140)
-    assert sorted(i.at_s for i, _ in box.kept) == [0.5, 100.5]
-
-
 def test_a_flood_of_garbage_on_watched_keys_begins_nothing(box):
     for number in range(100):
         box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")

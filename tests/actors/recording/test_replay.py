@@ -198,26 +198,24 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(recording, t
     assert list(folder.iterdir()) == []
 
 
-async def test_tools_find_a_replay_and_give_it_no_orders(recording, port):
+async def test_tools_find_a_replay_that_is_no_robot_and_takes_no_orders(
+        recording, port, monkeypatch):
+    other, found, second = free_base_port(), run_info.find_runs, Replay(recording, port=port)
     async with playing(Replay(recording, port=port, loop=True)), reading(port):
         async with connect(port) as session:
             assert session.run.replay_of.endswith("run.mcap")
             assert session.run.title == "replay of run.mcap: a sample"
             assert set(session.run.nodes) == {"localization", "DM1"}
-            found = await session.latest((topics.POSE,), 10.0)
-            assert isinstance(found[topics.POSE.key], m.Pose)
+            latest = await session.latest((topics.POSE,), 10.0)
+            assert isinstance(latest[topics.POSE.key], m.Pose)
             with pytest.raises(UsageError, match=f"port {port} is a replay of"):
                 await session.command(ftm_topics.RESET, fm.Reset("RM1", "me"), lambda: True, 1.0)
-
-
-async def test_who_names_no_port_means_the_robot_and_not_the_replay(recording, port, monkeypatch):
-    other = free_base_port()
-    found = run_info.find_runs
-    async with playing(Replay(recording, port=port, loop=True)), reading(port):
+        with pytest.raises(UsageError, match=f"--port {port}: in use"):
+            await second.run(asyncio.Event())
         monkeypatch.setattr(run_info, "find_runs", lambda: [
             run for run in found() if run.base_port in (port, other)])
         assert run_info.find_run().replay_of
-        with AnsweringLauncher(other, 0.0):
+        with AnsweringLauncher(other, 0.0):  # who names no port means the robot
             assert run_info.find_run().base_port == other
             assert run_info.find_run(port).replay_of
 
@@ -235,13 +233,6 @@ def test_a_port_in_use_is_refused(recording, port, capsys, monkeypatch):
     monkeypatch.setattr(replaying, "find_processes", lambda: [node])
     with pytest.raises(UsageError, match=f"--port {port}: belongs to a run"):
         Replay(recording, port=port)
-
-
-async def test_a_second_replay_on_the_same_port_is_refused(recording, port):
-    second = Replay(recording, port=port)
-    async with playing(Replay(recording, port=port, loop=True)), reading(port):
-        with pytest.raises(UsageError, match=f"--port {port}: in use"):
-            await second.run(asyncio.Event())
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -322,35 +313,20 @@ async def test_the_page_of_a_robot_without_application_is_a_replay_s_and_all_of_
 
 
 async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
-    status = m.MissionStatus("1", "AB", m.MissionPhase.RUNNING, 0, (), (), (), "")
     manager = fm.ManagerStatus(("FTM1",), (), ("RM1",), ("RM1",), "safety-first", 1)
-    sent = [*(pose(n + 1, n * 0.05) for n in range(20)),
-            *((n * 0.1, topics.MISSION_STATUS.at(),
-               encode(Header("mission_manager", 1, n + 1, n * 0.1), status)) for n in range(10)),
-            *((n * 0.1, ftm_topics.MANAGER_STATUS.at(),
-               encode(Header("ftm_manager", 1, n + 1, n * 0.1), manager)) for n in range(10))]
-    write(tmp_path / "run.mcap", sorted(sent))
-    page_port = port + 30
+    write(tmp_path / "run.mcap", sorted([
+        *(pose(n + 1, n * 0.05) for n in range(20)),
+        *((n * 0.1, ftm_topics.MANAGER_STATUS.at(),
+           encode(Header("ftm_manager", 1, n + 1, n * 0.1), manager)) for n in range(10))]))
+    page_port, seen = port + 30, ""
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
     async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
         url = f"http://127.0.0.1:{page_port}/"
         document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert b"<html" in document
-        async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page:
+        async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page, asyncio.timeout(15):
             await page.send(msgspec.json.encode(ResetRequest("RM1")).decode())
-            told, airport, seen = "", None, ""
-            deadline = time.monotonic() + 15
-            while not (told and airport and "FTM1" in seen):
-                assert time.monotonic() < deadline, (told, airport, seen[:500])
-                text = await asyncio.wait_for(page.recv(), 10)
-                message = json.loads(text)
-                if message.get("type") == "hello":
-                    airport = message["map"]["name"]
-                    assert not any("stick" in panel for panel in message["panels"])
-                elif "replay" in text and message.get("type") not in ("state", "hello"):
-                    told = text
-                else:
-                    seen += text if isinstance(text, str) else text.decode()
-        assert "no robot can obey" in told
-        assert airport
+            while not all(word in seen for word in ("no robot can obey", '"map"', "FTM1")):
+                text = await page.recv()
+                seen += text if isinstance(text, str) else text.decode()
         assert heard == []

@@ -79,7 +79,7 @@ answer = {{ success = true, message = "told" }}
 """
 
 
-def test_topics_and_services_both_ways_and_a_killed_gateway_comes_back(tmp_path, monkeypatch):
+def test_topics_and_services_both_ways(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     port = free_port()
     text = SYSTEM.replace('''actor = "tests.actors.ros2.robot:Base"
@@ -104,8 +104,3 @@ parameters = {{ connect = ["tcp/127.0.0.1:{port}"], distribution = "kilted" }}
             assert "ros2      linked, 2 nodes, 0 messages refused" in shown.stdout, shown
             told = json.loads(run.tool("status", "--json").stdout)["ros2"]
             assert set(told["nodes"]) == {"/rampart", "/sdk_base"}
-            before = run.pid("gateway")
-            run.kill("gateway")
-            wait_until(lambda: run.pid("gateway") not in {None, before}, 10)
-            heard = len(peer.said("heard"))
-            wait_until(lambda: len(peer.said("heard")) > heard + 20, 10)

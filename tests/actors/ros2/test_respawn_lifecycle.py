@@ -152,18 +152,6 @@ async def test_the_step_that_fails_is_named(case, state, next_states, answers, w
 
 
 @within(played)
-async def test_a_refused_transition_is_requested_again(case):
-    case.next = {}
-    await case.die_and_come_back("planner", 1, state=1)
-    await case.play(0.5)
-    assert set(case.changes) == {1}
-    assert len(case.changes) > 1
-    case.next = {(1, 1): 2, (2, 3): ACTIVE}
-    await case.play(0.6)
-    assert case.report.phase.value == "done"
-
-
-@within(played)
 async def test_a_node_that_dies_while_it_is_configured_is_respawned_again(case):
     case.next = {}
     await case.die_and_come_back("planner", 1, state=1)
