@@ -13,8 +13,9 @@ from rampart.actors.bus.fields import Field
 from rampart.actors.bus.messages import Message
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor
-from rampart.testing import VirtualSystem, run
+from rampart.testing import VirtualSystem
 from tests.tank import LEVEL, TOPICS, Level, Phase, Pump
+from tests.virtual_time import within
 
 
 class Arm(Message):
@@ -58,14 +59,11 @@ class Gauge(Actor):
 @pytest.mark.parametrize(("message", "where", "kind"), [
     (Level(np.float64(1.0)), "height_m", "numpy.float64"),
     (Level(1.0, (0.0, np.float32(1.0))), "cells[1]", "numpy.float32")])
-def test_a_value_of_numpy_is_refused_by_topic_and_field(message, where, kind):
-    async def scenario() -> None:
-        async with VirtualSystem(topics=TOPICS) as system:
-            with pytest.raises(
-                    TypeError, match=rf"^topic tank/level: \$\.{re.escape(where)}: .*{kind} "):
-                system.start("gauge", Gauge).publish(LEVEL, message)
-
-    run(scenario)
+@within(lambda: VirtualSystem(topics=TOPICS))
+async def test_a_value_of_numpy_is_refused_by_topic_and_field(system, message, where, kind):
+    with pytest.raises(
+            TypeError, match=rf"^topic tank/level: \$\.{re.escape(where)}: .*{kind} "):
+        system.start("gauge", Gauge).publish(LEVEL, message)
 
 
 def test_an_item_that_a_list_lacks_is_named():

@@ -11,8 +11,9 @@ from rampart.actors.detection.watchdog import Watchdog, WatchdogCore
 from rampart.actors.ftm import messages as m
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.testing import Ear, play, run, table
+from rampart.testing import Ear, play, table
 from tests.osmosis_system import System
+from tests.virtual_time import within
 
 # One node. b heartbeat of the first process, B of the second, g one sent before the last event;
 # what the supervisor publishes: p the first is started, x it has crashed, s it is stopped, w it
@@ -115,19 +116,17 @@ class Node(Actor):
     """A node that does nothing but beat."""
 
 
-def test_without_a_supervisor_a_node_whose_loop_hangs_is_reported_after_twice_the_timeout():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            node = system.start("a", Node)
-            system.start("DM4", Watchdog, watch=["a"], timeout_s=0.35)
-            await asyncio.sleep(0.55)
-            node.hold(True)
-            await asyncio.sleep(0.5)
-            assert ear.states == ["idle"]
-            await asyncio.sleep(0.2)
-            assert ear.heard[-1][1].reason == "a: no heartbeat for 0.7 s"
-            active_s = next(at for at, r in ear.heard if r.state is m.DetectionState.ACTIVE)
-            assert active_s == pytest.approx(0.5 + 2 * 0.35, abs=1e-3)
-
-    run(scenario)
+@within(System)
+async def test_without_a_supervisor_a_node_whose_loop_hangs_is_reported_after_twice_the_timeout(
+        system):
+    ear = system.start("ear", Ear)
+    node = system.start("a", Node)
+    system.start("DM4", Watchdog, watch=["a"], timeout_s=0.35)
+    await asyncio.sleep(0.55)
+    node.hold(True)
+    await asyncio.sleep(0.5)
+    assert ear.states == ["idle"]
+    await asyncio.sleep(0.2)
+    assert ear.heard[-1][1].reason == "a: no heartbeat for 0.7 s"
+    active_s = next(at for at, r in ear.heard if r.state is m.DetectionState.ACTIVE)
+    assert active_s == pytest.approx(0.5 + 2 * 0.35, abs=1e-3)

@@ -27,6 +27,7 @@ from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import run
 from tests.manager.bench import FULL
 from tests.osmosis_system import System, run_context
+from tests.virtual_time import within
 
 FILE = "osmosis.toml"
 CHOSEN = collections.defaultdict(lambda: topics.COMMAND)
@@ -139,15 +140,12 @@ def test_the_parameters_of_an_actor_of_one_s_own_are_checked_likewise(parameters
         load_member(node, spec, "x.toml")
 
 
-def test_an_actor_of_one_s_own_reads_its_parameters_by_their_names():
-    async def scenario() -> None:
-        async with System() as system:
-            lamp = system.start("lamp", Lamp, brightness_cd=3)
-            assert (lamp.parameters.brightness_cd, lamp.parameters.near) == (3.0, ("hmi",))
-            with pytest.raises(SpecificationError, match=r"^lamp: parameters\.brightness_cd = -1"):
-                system.start("lamp", Lamp, brightness_cd=-1)
-
-    run(scenario)
+@within(System)
+async def test_an_actor_of_one_s_own_reads_its_parameters_by_their_names(system):
+    lamp = system.start("lamp", Lamp, brightness_cd=3)
+    assert (lamp.parameters.brightness_cd, lamp.parameters.near) == (3.0, ("hmi",))
+    with pytest.raises(SpecificationError, match=r"^lamp: parameters\.brightness_cd = -1"):
+        system.start("lamp", Lamp, brightness_cd=-1)
 
 
 # -- the actors that ship ------------------------------------------------------------------------
