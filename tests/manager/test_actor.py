@@ -132,15 +132,6 @@ async def whole() -> AsyncIterator[Whole]:
         yield system
 
 
-@within(whole)
-async def test_a_healthy_system_decides_nothing_in_a_minute(system):
-    await asyncio.sleep(60.0)
-    assert system.decisions == []
-    assert system.problems == []
-    assert system.pilot.heard == 0
-    assert system.base.orders == []
-
-
 @pytest.mark.parametrize(("node", "mechanism", "recovery"), [
     ("osmosis_control", "FTM4", "RM3"), ("hmi", "FTM5", "RM4"), ("localization", "FTM7", "RM4")])
 @within(whole)
@@ -180,21 +171,6 @@ async def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset(
 
 
 @within(whole)
-async def test_a_recovery_module_that_is_respawned_while_activated_is_commanded_again(system):
-    system.robot.silent.add("pose")
-    await asyncio.sleep(2.0)
-    await system.kill("RM5")
-    await system.settle()
-    before = system.pilot.heard
-    system.revive("RM5")
-    await system.settle()
-    assert system.pilot.heard > before
-    assert system.pilot.mode is PilotMode.TELEOPERATION
-    await asyncio.sleep(1.0)
-    assert system.status.activated == ("RM5",)
-
-
-@within(whole)
 async def test_a_respawned_detection_module_does_not_let_go_of_a_fault_that_persists(system):
     system.robot.silent.add("command")
     await asyncio.sleep(2.0)
@@ -226,16 +202,6 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
     await asyncio.sleep(2.0)
     assert [(r.request, r.node, r.failed_incarnation)
             for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
-
-
-@within(whole)
-async def test_a_detection_module_whose_reports_are_old_news_is_silent(system):
-    system.supervisor.answer = "nothing"
-    system.inject(ftm_topics.DETECTION, "freeze", 60.0, member="DM3")
-    await asyncio.sleep(0.5)
-    assert system.status.silent == ()
-    await asyncio.sleep(1.0)
-    assert system.status.silent == ("DM3",)
 
 
 @pytest.mark.parametrize("dies_too", [(), ("RM1",)], ids=["alone", "with RM1"])

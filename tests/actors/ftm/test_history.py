@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sqlite3
-import subprocess
-import sys
 
 import pytest
 
@@ -103,27 +99,6 @@ def test_a_run_without_a_fault_heals_it_unless_its_run_lives(tmp_path):
         history.close()
     assert {f.node: f.state for f in read_history(tmp_path)} == {
         "dead": "healed", "alive": "confirmed", "now": "confirmed"}
-
-
-def test_it_is_read_while_a_run_writes_it_and_after_the_run_was_killed(tmp_path):
-    writer = subprocess.Popen([sys.executable, "-c", (
-        "import sys; from pathlib import Path\n"
-        "from rampart.actors.ftm.history import Fault, History\n"
-        "history = History(Path(sys.argv[1]), 'r1'); at_s = 0\n"
-        "while True:\n"
-        "    history.put([Fault(mechanism='DM7', node='pump', error='', state='confirmed',"
-        " times=1)], at_s); at_s += 1\n"
-        "    if at_s == 100: print('ready', flush=True)\n"), str(tmp_path)],
-        stdout=subprocess.PIPE)
-    assert writer.stdout.readline()
-    during = read_history(tmp_path)[0].times
-    os.kill(writer.pid, signal.SIGKILL)
-    writer.wait()
-    writer.stdout.close()
-    assert read_history(tmp_path)[0].times >= during >= 100
-    history = History(tmp_path, "r2")
-    assert history.problem == ""
-    history.close()
 
 
 NOT_A_DATABASE = b"this is no database, and long enough to be none" * 40

@@ -31,10 +31,6 @@ def all_of(*inputs: str) -> Connective:
     return Connective(inputs, len(inputs), len(inputs))
 
 
-def at_least(k: int, *inputs: str) -> Connective:
-    return Connective(inputs, k, len(inputs))
-
-
 def occurs(tree: Formula, occurred: frozenset[str]) -> bool:
     """Whether the top occurs when exactly these basic events do."""
     value = {name: name in occurred for name in tree.basic} | tree.house
@@ -102,13 +98,6 @@ def test_hundreds_of_shared_events_and_millions_of_sets_are_counted_not_listed()
     assert sum(found.sizes) == found.count
     assert len(list(found.sets(limit=5))) == 5
     assert [CutSets(ladder(n)).count for n in (1, 2, 5, 9)] == [2, 2, 5, 16]  # vertex covers
-
-
-@pytest.mark.parametrize(("state", "count"), [(True, 1), (False, 0)])
-def test_a_top_that_is_constant_has_the_empty_set_or_none(state, count):
-    found = CutSets(formula({"top": any_of("h")}, {"h": state}))
-    assert found.count == count
-    assert list(found.sets()) == [()] * count
 
 
 def test_thousands_of_gates_in_a_chain_are_no_problem():

@@ -49,16 +49,6 @@ def test_a_count_a_constant_and_an_event_without_its_kind_have_their_meaning(bod
     assert cut_sets(mef(gate("top", body))) == expected
 
 
-def test_what_does_not_decide_cut_sets_is_read_over():
-    text = mef("<label>a tree</label>",
-               gate("top", "<label>it</label><attributes><attribute name='x' value='y'/>"
-                           f"</attributes><or>{events('a', 'b')}</or>"),
-               data="<model-data><define-basic-event name='a'><float value='0.1'/>"
-                    "</define-basic-event><define-parameter name='p'><float value='1'/>"
-                    "</define-parameter></model-data>")
-    assert cut_sets(text) == sets("a", "b")
-
-
 def test_private_names_of_components_do_not_meet():
     inner = gate("g", f"<or>{events('e')}</or>", ' role="private"') + \
         '<define-basic-event name="e" role="private"/>'

@@ -3,7 +3,7 @@
 import pytest
 
 from rampart.manager.arbitration.arbiter import build_arbiter
-from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.arbitration.arbiter_memory import Memory, objection
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from tests.manager.bench import DMS, RMS, Bench, edited, paper
 
@@ -65,8 +65,6 @@ def test_a_failure_is_forgiven_with_its_own_cause_whatever_else_is_active():
     assert bench.state.recoveries[2].failed_for == ("FTM4",)
     bench.play("-DM4; RM2 idle; wait 20")
     assert not bench.state.recoveries[2].failure
-
-
 
 
 def test_a_late_one_in_the_way_is_released():
@@ -153,18 +151,3 @@ def test_a_number_that_was_never_given_is_not_counted_on_from():
     bench.report("RM2", DONE, decision=10**6)  # nobody asks
     bench.active("DM1")
     assert bench.state.number < 100
-
-
-def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
-    spec = edited(RM2={"latched": True})
-    bench = Bench(spec)
-    bench.active("DM2")
-    bench.report("RM2", DONE)
-    bench.active("DM1")
-    assert bench.orders == "RM1"
-    memory = remember(bench.state, bench.arbiter)
-    assert {latch.command.recovery for latch in memory.latches} == {"RM1", "RM2"}
-    assert objection(memory) == ""
-    state = recall(bench.arbiter, memory, 100.0, 0)
-    assert set(state.latched) == {"RM1", "RM2"}
-    assert [t.wanted for t in state.recoveries[:2]] == [True, False]

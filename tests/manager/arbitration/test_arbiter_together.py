@@ -139,14 +139,3 @@ def test_a_shadow_tells_where_it_would_have_run_something_else():
     bench.wait(5.0)
     assert len(differences(bench.log)) == 1  # once a decision
     assert bench.orders == "RM2"  # it does nothing itself
-
-
-def test_a_patient_shadow_is_told_who_is_late():
-    """Nothing new is decided, but the shadow would have climbed to RM2."""
-    bench = Bench(system(shadow="mission-first", recoveries={"RM3": {"deadline_s": 60.0}}))
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", ACTING)
-    assert differences(bench.log) == []
-    (differed,) = differences(bench.wait(5.0))
-    assert (differed.taken, differed.decision.recoveries) == (("RM3",), ("RM2",))
-    assert bench.orders == "RM3"

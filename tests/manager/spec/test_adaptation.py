@@ -97,8 +97,6 @@ def test_values_are_read_as_toml_and_words_as_text(text, value):
             parse_value(neither)
 
 
-
-
 # -- the manager ---------------------------------------------------------------------------------
 
 
@@ -199,18 +197,6 @@ async def test_what_is_refused_changes_nothing(system):
     system.robot.silent.add("command")
     await asyncio.sleep(1.5)
     assert system.taken == [(("FTM2",), 1, ("RM2",))]
-
-
-@within(adaptable)
-async def test_a_mechanism_that_is_disabled_does_not_recover(system):
-    assert (await system.ask("disable", "FTM5")).accepted
-    await system.kill("hmi")
-    await asyncio.sleep(2.0)
-    assert system.decisions == []
-    assert (await system.ask("enable", "FTM5")).accepted
-    await asyncio.sleep(1.0)
-    assert system.taken[0] == (("FTM5",), 1, ("RM4",))
-    assert system.incarnations["hmi"] == 2
 
 
 @within(partial(adaptable, keys="keys"))
