@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import msgspec
 
@@ -36,10 +37,15 @@ def full_system() -> SystemSpec:
     return parse_specification(FULL, "systems/osmosis.toml")
 
 
-def edited(**fields) -> SystemSpec:
-    """The shipped system with recoveries changed: `RM3=dict(deadline_s=1.0)`."""
-    return msgspec.structs.replace(paper(), recoveries=tuple(
-        msgspec.structs.replace(r, **fields.get(r.name, {})) for r in paper().recoveries))
+def edited(**changes: Any) -> SystemSpec:
+    """The shipped system with rows and fields changed: `RM3=dict(deadline_s=1.0), strategy="x"`."""
+    def rows(table):
+        return tuple(msgspec.structs.replace(row, **changes.pop(row.name, {})) for row in table)
+
+    spec = paper()
+    spec = msgspec.structs.replace(
+        spec, mechanisms=rows(spec.mechanisms), recoveries=rows(spec.recoveries))
+    return msgspec.structs.replace(spec, **changes)
 
 
 class Bench:

@@ -96,6 +96,7 @@ def three():
         orders={"safer": {"RM1": ("RM2",), "RM2": ("RM3",)}})
 
 
+@pytest.mark.nightly
 def test_two_recoveries_at_a_time_and_all_together_lead_to_the_same_verdicts():
     by_pairs, whole = (verify(three(), ["safety-first"], together) for together in (2, 3))
     assert whole.states > 3 * by_pairs.states / 2

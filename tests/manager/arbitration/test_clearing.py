@@ -26,18 +26,12 @@ from rampart.manager.spec.clearing import clearing_in_words, reset_role
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
 from rampart.testing import VirtualSystem, run
-from tests.manager.bench import PAPER, Bench, full_system, paper
+from tests.manager.bench import PAPER, Bench, edited, full_system
 from tests.osmosis_system import run_context
 
 
-def clearing(**fields):
-    """The paper's system with other mechanisms: `FTM2=dict(clears=Clears.NEVER)`."""
-    return replace(paper(), mechanisms=tuple(
-        replace(m, **fields.get(m.name, {})) for m in paper().mechanisms))
-
-
 def bench(**fields) -> Bench:
-    return Bench(clearing(FTM2=fields))
+    return Bench(edited(FTM2=fields))
 
 
 STOPPED = "DM2 osmosis_control > +RM2; RM2 done; -DM2; wait 1.0"
@@ -79,7 +73,7 @@ def test_a_mechanism_whose_recovery_a_safer_one_replaces_is_not_cleared_by_that_
 
 def test_it_is_remembered_although_its_recovery_never_ran():
     """A safer recovery was in force already, and ends first."""
-    run = Bench(clearing(FTM1={"clears": None}, FTM4={"clears": Clears.BY_OPERATOR}))
+    run = Bench(edited(FTM1={"clears": None}, FTM4={"clears": Clears.BY_OPERATOR}))
     run.play("DM1 > +RM1; RM1 done; DM4; -DM4; wait 1.0; -DM1; wait 1.0; reset RM1; wait 0.1")
     run.play("active: FTM4; latched: RM3; reset RM3; active:")
 
@@ -123,7 +117,7 @@ def test_contradictions_are_refused_at_load(text, words):
 
 
 def test_words_about_clearing():
-    words = clearing_in_words(clearing(
+    words = clearing_in_words(edited(
         FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject", "clear_after_s": 5.0},
         FTM3={"clears": Clears.NEVER}))
     assert [words[name] for name in ("FTM1", "RM1", "FTM2", "FTM3", "FTM4")] == [
@@ -133,7 +127,7 @@ def test_words_about_clearing():
 
 
 def test_a_recovery_needs_the_highest_role_of_its_mechanisms():
-    spec = clearing(FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject"})
+    spec = edited(FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject"})
     assert [reset_role(spec, name) for name in ("RM1", "RM2")] == ["drive", "inject"]
     assert reset_role(full_system(), "RM1") == "drive"
 
@@ -146,7 +140,7 @@ def property_of(report):
 
 
 def test_verification_covers_what_clears_and_finds_an_arbiter_that_clears_too_early(monkeypatch):
-    spec = clearing(**CLEARED)
+    spec = edited(**CLEARED)
     spec = replace(
         spec, mechanisms=tuple(m for m in spec.mechanisms if m.name in CLEARED),
         recoveries=tuple(r for r in spec.recoveries if r.name in {"RM1", "RM2"}),
