@@ -16,6 +16,7 @@ from rampart.testing import (
     eventually,
     play,
     run,
+    virtual_run,
     wait_until,
     wake,
 )
@@ -101,3 +102,18 @@ def test_a_monitor_that_is_due_for_ever_or_gives_no_reason_is_found_out():
     odd.due_s = 0.5
     with pytest.raises(AssertionError, match=r"due again at 0\.5 s"):
         wake(odd, 1.0)
+
+
+# -- `virtual_run`: a whole system for tests of one's own
+
+
+def test_a_system_runs_with_its_faults_as_long_as_it_is_told():
+    done = virtual_run(CELL, "kill:gripper@1", seconds=3.0, seed=4)
+    assert done.record.restarts["gripper"] == 1
+    assert done.failures == ()
+    assert done.trace == virtual_run(CELL, "kill:gripper@1", seconds=3.0, seed=4).trace
+
+
+def test_a_system_without_an_end_has_to_be_told_when():
+    with pytest.raises(ValueError, match=r"cell\.toml: has no \[end\]"):
+        virtual_run(CELL)
