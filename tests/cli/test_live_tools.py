@@ -92,31 +92,22 @@ def test_top_tells_a_script_everything_once(run):
     assert "\x1b" not in told.stdout
 
 
-@pytest.mark.parametrize("keys", ["q", "\x03"], ids=["q", "ctrl-c"])
-def test_top_leaves_the_terminal_as_it_was(run, keys):
-    with PseudoTerminal("top", "--port", str(run.port), NO_COLOR="1") as it:
-        it.wait_for("simulator")
-        it.wait_for(lambda: it.text.count("rampart top") >= 3)  # it is refreshed
-        assert not it.is_as_before
-        it.press(keys)
-        assert it.end() == 0
-        assert it.is_as_before
-        assert it.raw.count("\x1b[?1049h") == it.raw.count("\x1b[?1049l") == 1
-        assert it.raw.rfind("\x1b[?25h") > it.raw.rfind("\x1b[?25l")
-        colours = re.findall(r"\x1b\[([0-9;]*)m", it.raw)
-        assert not [c for c in colours if re.search(r"(^|;)(3[0-8]|4[0-8]|9\d|10\d)(;|$)", c)]
-
-
-def test_top_shows_a_crash_in_words_and_the_new_life(run):
-    with PseudoTerminal("top", "--port", str(run.port), columns=120, rows=50) as it:
+def test_top_shows_a_crash_and_the_new_life_and_leaves_the_terminal_as_it_was(run):
+    with PseudoTerminal("top", "--port", str(run.port), columns=120, rows=50, NO_COLOR="1") as it:
         it.wait_for("teleoperation")
         life = run.pid("hmi")
         run.kill("hmi")
         it.wait_for(": RM4: FTM5, because")  # in the words of the decision
         run.wait_until(lambda: run.pid("hmi") not in {None, life}, 20, "hmi did not come back")
         it.wait_for(lambda: re.search(r"hmi +running +[2-9] +[1-9]", it.text) is not None)
+        assert not it.is_as_before
         it.press("q")
         assert it.end() == 0
+        assert it.is_as_before
+        assert it.raw.count("\x1b[?1049h") == it.raw.count("\x1b[?1049l") == 1
+        assert it.raw.rfind("\x1b[?25h") > it.raw.rfind("\x1b[?25l")
+        colours = re.findall(r"\x1b\[([0-9;]*)m", it.raw)
+        assert not [c for c in colours if re.search(r"(^|;)(3[0-8]|4[0-8]|9\d|10\d)(;|$)", c)]
 
 
 # -- joystick -----------------------------------------------------------------------------------
@@ -139,13 +130,8 @@ def test_a_held_key_drives_and_without_its_repetition_or_its_process_the_robot_s
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
         assert all(linear == 0.0 and turn >= 0.0 for linear, turn in map(twist, heard()))
         assert max(turn for _, turn in map(twist, heard())) > 0.0
-        it.press("q")
-        assert it.end() == 0
-        assert it.is_as_before
-    with echo(run, "teleoperation/command") as heard, \
-            PseudoTerminal("joystick", "--port", str(run.port), "--speed", "0.2") as it:
-        it.wait_for("hold a key")
-        hold(it, LEFT, lambda: len(heard()) > 5)
+        before = len(heard())
+        hold(it, LEFT, lambda: len(heard()) > before + 5)
         it.process.kill()
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
 
@@ -163,6 +149,7 @@ def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
         it.press("q")
         assert it.end() == 0
+        assert it.is_as_before
 
 
 def test_the_keyboard_needs_a_terminal_and_a_joystick_its_device(run):
@@ -203,14 +190,9 @@ def test_prometheus_is_given_the_figures_of_the_run(run):
         run.wait_until(complete, 20, "the figures did not come")
         found = scrape(url)
         assert value(found, "node_up", node="simulator") == 1
-        assert value(found, "node_incarnation", node="simulator") == 1
         assert value(found, "heartbeat_age_seconds", node="safety_pilot") < 60
         assert value(found, "mission_phase", rampart_mission_phase="running") == 1
-        assert value(found, "mission_steps", mission="AB") > 1
-        assert value(found, "obstacle_clearance_meters") > 0
         assert value(found, "messages", "messages_total", topic="localization/pose") > 0
-        assert value(found, "process_cpu_seconds", "process_cpu_seconds_total",
-                     process="simulator") > 0
         assert value(found, "process_resident_memory_bytes", process="launch.py") > 1e6
         with urllib.request.urlopen(urllib.request.Request(
                 url, headers={"accept": "application/openmetrics-text"}), timeout=10) as answer:

@@ -73,23 +73,17 @@ def test_what_it_makes_runs_on_processes(tmp_path, monkeypatch):
     assert json.loads(done.stdout.splitlines()[-1])["safety"] == "safe", done.stderr
 
 
-DIES = {
-    "after five seconds": ("    def step(self) -> None:\n", "        if self.clock.now() > 5:\n"
-                           "            raise RuntimeError('died')\n"),
-    "at its start": ("    parameters: Parameters\n", "    def __init__(self, context):\n"
-                     "        raise ValueError('a broken model')\n")}
-
-
-@pytest.mark.parametrize(("when", "name", "by_s"), [
-    ("after five seconds", "mortal", 6.5), ("at its start", "stillborn", 1.5)])
-def test_a_world_that_dies_ends_its_run_and_safety_is_not_known(tmp_path, monkeypatch, when, name,
-                                                                by_s):
+@pytest.mark.parametrize(("name", "code", "by_s"), [
+    ("mortal", ("    def step(self) -> None:\n",
+                "        if self.clock.now() > 5:\n            raise RuntimeError('died')\n"), 6.5),
+    ("stillborn", ("    parameters: Parameters\n",
+                   "    def __init__(self, context):\n        raise ValueError('broken')\n"), 1.5)])
+def test_a_world_that_dies_ends_its_run_and_safety_is_not_known(
+        tmp_path, monkeypatch, name, code, by_s):
+    before, more = code
     robot = made(tmp_path, monkeypatch, name)
     world = robot / name / "world.py"
-    before, more = DIES[when]
-    text = world.read_text()
-    assert text.count(before) == 1
-    world.write_text(text.replace(before, before + more))
+    world.write_text(world.read_text().replace(before, before + more))
     done = virtual_run(robot / f"{name}.toml")
     assert (done.record.mission, done.record.safety) == ("fail", "not known")
     assert (done.judgement.success, done.judgement.safe) == (False, None)
@@ -108,37 +102,25 @@ def test_a_world_that_is_killed_ends_its_run_with_exit_code_4(tmp_path, monkeypa
     assert result["duration_s"] < 20
 
 
-@pytest.mark.parametrize("name", ["Courier", "9lives", "a-b", "a b", "", "../x", "/tmp/x", "class",
-                                  "x" * 32, "naïve"])
-def test_a_name_that_no_package_can_have_is_refused(tmp_path, monkeypatch, refused, name):
+def test_a_name_that_no_package_can_have_or_that_is_taken_is_refused(
+        tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
-    assert refused("new", name).startswith(
-        f"rampart: NAME {name!r}: expected at most 31 small letters, digits and _")
+    for name in ("Courier", "9lives", "a-b", "", "../x", "/tmp/x", "class", "x" * 32, "naïve"):
+        assert refused("new", name).startswith(
+            f"rampart: NAME {name!r}: expected at most 31 small letters, digits and _")
+    for name in ("json", "numpy", "controller"):
+        assert "another module or node has this name already" in refused("new", name)
     assert contents(tmp_path) == {}
 
 
-@pytest.mark.parametrize("name", ["json", "numpy", "tests", "controller"])
-def test_a_name_that_is_taken_is_refused(tmp_path, monkeypatch, refused, name):
+def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
-    assert "another module or node has this name already" in refused("new", name)
-    assert contents(tmp_path) == {}
-
-
-@pytest.mark.parametrize("there", ["folder", "empty folder", "file", "dangling link"])
-def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, refused, there):
-    place = tmp_path / "courier"
-    if there == "file":
-        place.write_text("mine")
-    elif there == "dangling link":
-        place.symlink_to(tmp_path / "gone")
-    else:
-        place.mkdir()
-    if there == "folder":
-        (place / "nodes.py").write_text("mine")
-    before = contents(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    assert refused("new", "courier") == "rampart: courier: exists already; nothing was changed\n"
-    assert contents(tmp_path) == before
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "nodes.py").write_text("mine")
+    for name in ("link", "folder"):
+        assert refused("new", name) == f"rampart: {name}: exists already; nothing was changed\n"
+    assert contents(tmp_path) == {"folder/nodes.py": b"mine"}
     assert not (tmp_path / "gone").exists()
 
 

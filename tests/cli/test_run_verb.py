@@ -44,14 +44,6 @@ def test_a_run_whose_page_would_have_another_program_s_port_is_refused(tmp_path,
     assert not (tmp_path / "report").exists()
 
 
-def test_a_system_without_an_application_offers_no_options_or_examples_of_a_robot(capsys):
-    with pytest.raises(SystemExit):
-        launch.main(["--system", str(CELL), "--help"])
-    told = capsys.readouterr().out
-    assert "--airport" not in told
-    assert "osmosis_control" not in told
-
-
 def test_the_verb_writes_its_report_where_one_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert rampart(["run", *SHORT]) == 0
@@ -92,7 +84,6 @@ REFUSED = [
     (["--airport", "atlantis"], "atlantis"),
     (["--airport", str(CELL)], "cell.toml: title: 'Pick and place behi"),
     (["--strategy", "hope"], "hope"),
-    (["--shadow", "bold"], "--shadow bold: unknown strategy; known: "),
     (["--system", "nowhere.toml"], "nowhere.toml"),
     (["--system", "/tmp"], "--system /tmp: is a directory"),
     (["--system", sys.executable], "not UTF-8 text"),
@@ -101,11 +92,9 @@ REFUSED = [
      "--rate 0.5: expected 1: node gateway exchanges messages with a robot on the wall clock, and"),
     (["--system", "link.toml", "--rate", "4"], "--rate 4: expected 1: node link exchanges"),
     (["--obstacles", "-1"], "--obstacles -1"),
-    (["--obstacles", "99"], "99"),
     (["--port", "80"], "--port 80"),
     (["--patience", "nan"], "nan"),
     (["--duration", "5"], "--duration 5: a mission ends by itself"),
-    (["--report", "/proc/x"], "--report /proc/x: expected a directory that can be written"),
     (["--report", __file__], f"--report {__file__}: expected a directory that can be written"),
     (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
     (["--host", "ground"], "--host ground: osmosis has no [[host]]; it runs on one machine"),
@@ -116,15 +105,14 @@ REFUSED = [
     ([*OF_TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
     ([*OF_TANK, "--joystick"], f"--joystick: {NO_OPTION}"),
     *(([*OF_TANK, *page], "no node of tank serves an operator's page")
-      for page in (["--wait"], ["--hmi-port", "9000"], ["--hmi-host", "0.0.0.0"])),
+      for page in (["--wait"], ["--hmi-host", "0.0.0.0"])),
     ([*TWO, "--host", "moon", "--no-keys"], "--host moon: unknown; known: robot, ground"),
     (GROUND, "osmosis runs on 2 hosts: expected --keys DIR"),
-    (TWO, "osmosis runs on 2 hosts: expected --keys DIR"),
     ([*TWO, "--no-keys", "--keys", "keys"], "--no-keys: contradicts --keys"),
     ([*GROUND, "--virtual"], "--host ground: not with --virtual"),
     *(([*GROUND, "--no-keys", option, value], f"{option} {value}: on host ground, the "
        "command line of the first host decides this")
-      for option, value in (("--seed", "7"), ("--mission", "A"), ("--record", "x.mcap"))),
+      for option, value in (("--seed", "7"), ("--mission", "A"))),
     ([*TWO, "--no-keys", "--hmi-port", "9000"],
      "--hmi-port 9000: no node of osmosis on host the first serves an operator's page"),
     ([*TWO, "--no-keys"], "cannot listen at 192.0.2.1 port 7462 for the other hosts"),
@@ -133,9 +121,8 @@ REFUSED = [
     (["--overwrite"], "--overwrite: only with --record FILE"),
     (["--virtual", "--black-box"], "--black-box: not with --virtual"),
     ([*TWO, "--no-keys", "--black-box"], "--black-box: not on several hosts"),
-    *((["--hmi-host", host, "--hmi-unencrypted"],
-       f"--hmi-host {host}: expected an address of this machine")
-      for host in ("192.0.2.1", "no such host")),
+    (["--hmi-host", "192.0.2.1", "--hmi-unencrypted"],
+     "--hmi-host 192.0.2.1: expected an address of this machine"),
     (FOR_ALL, "--hmi-host 0.0.0.0: page on 0.0.0.0: has to be encrypted, because other machines "
               "can reach it: --hmi-cert FILE --hmi-key FILE; or --hmi-unencrypted"),
     ([*FOR_ALL, "--hmi-cert", "robot.crt"],
@@ -153,8 +140,7 @@ REFUSED = [
     *((where, "launch.py: --hmi-token: every user of this machine can read a command line; put "
               "another token into a file of mode 0600 for --hmi-token-file FILE, or into the "
               "variable RAMPART_HMI_TOKEN")
-      for where in ([f"--hmi-token={TOKEN}"], ["--hmi-token"], ["--virtual", "--hmi-token", TOKEN],
-                    ["--no-hmi", "--hmi-token", TOKEN])),
+      for where in (["--hmi-token"], ["--virtual", "--hmi-token", TOKEN])),
 ]
 
 

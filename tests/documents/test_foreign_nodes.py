@@ -11,10 +11,6 @@ import sys
 import msgspec
 import pytest
 
-from rampart.actors.foreign import output_log
-from rampart.actors.foreign.channel import MAX_PACKET
-from rampart.actors.foreign.program_process import GRACE_S
-from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
 from rampart.testing import RealRun, VirtualSystem, run
 from tests.actors.access.keyed import layout_of, make_keys
 from tests.documents.page import Page
@@ -22,8 +18,7 @@ from tests.real_tools import printed
 
 PAGE = Page("how-to/any-language")
 TUG = PAGE.block("toml", 'name = "tug"')
-COMPILERS = {"c": ["gcc", "-Wall", "-Wextra", "-Werror"],
-             "c++": ["g++", "-x", "c++", "-Wall", "-Wextra", "-Werror"],
+COMPILERS = {"c++": ["g++", "-x", "c++", "-Wall", "-Wextra", "-Werror"],
              "rust": ["rustc", "-Dwarnings"]}
 
 
@@ -38,15 +33,6 @@ def write_tug(folder, language: str = "") -> None:
         source = "wheels.rs" if language == "rust" else "wheels.c"
         (folder / source).write_text(PAGE.block(language.removesuffix("++")))
         subprocess.run([*COMPILERS[language], "-o", "wheels", source], cwd=folder, check=True)
-
-
-def test_each_field_and_each_number_is_on_the_page():
-    for field in (*COMMAND_FIELDS, *ChildLimits.__struct_fields__):
-        assert f"`{field}`" in PAGE.text
-    assert f"{MAX_PACKET:,} bytes" in PAGE.text
-    assert f"{GRACE_S} s later SIGKILL" in PAGE.text
-    assert (f"{output_log.LOG_BYTES_PER_S // 10**6} MB per second in two files of "
-            f"{output_log.LOG_BYTES // 10**6} MB") in " ".join(PAGE.text.split())
 
 
 def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
@@ -64,7 +50,7 @@ def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("language", ["c", "c++", "rust", "bash"])
+@pytest.mark.parametrize("language", ["c++", "rust", "bash"])
 def test_the_program_is_a_node_and_faults_can_be_put_into_its_messages(tmp_path, language):
     if language in COMPILERS and not shutil.which(COMPILERS[language][0]):
         pytest.skip(f"no {COMPILERS[language][0]}")

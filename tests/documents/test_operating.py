@@ -16,7 +16,7 @@ from rampart.cli import run_options
 from rampart.cli.main import build_parser, main
 from rampart.cli.operate import kill_node
 from rampart.cli.run import main as run_main
-from tests import ROOT, system_file, two_hosts
+from tests import system_file, two_hosts
 from tests.documents.page import Page
 
 HOW_TO = {name: Page(f"how-to/{name}") for name in (
@@ -89,29 +89,6 @@ def test_a_recording_is_made_repaired_and_written_as_tables(tmp_path, monkeypatc
     assert list(tmp_path.glob("*/*.csv"))
 
 
-def test_doctor_is_the_first_thing_to_try(capsys):
-    assert "open files" in follow(capsys, "troubleshooting")
-
-
 def test_the_mechanism_for_a_lost_link_is_the_tested_one():
     shown = HOW_TO["several-machines"].of("toml")[1]
     assert tomllib.loads(shown) == tomllib.loads(two_hosts.HOME_WHEN_LOST)
-
-
-def test_the_symptoms_are_words_of_the_code():
-    sources = "\n".join(file.read_text(encoding="utf-8")
-                        for top in ("actors", "cli", "sim", "files", "manager")
-                        for file in (ROOT / top).rglob("*")
-                        if file.suffix in {".py", ".js"})
-    code = re.sub(r"[^a-z]+", " ", re.sub(r'"\s*\n\s*f?"', "", sources.lower()))
-    refused = HOW_TO["credentials"].section("## What a refused certificate looks like")
-    rows = re.findall(r"^\| (.*?) \|", HOW_TO["troubleshooting"].text + refused, re.MULTILINE)
-    symptoms = [part for row in rows for part in re.findall(r"`([^`]+)`|\*([^*]+)\*", row)]
-    unknown = []
-    for symptom in filter(None, (" ".join(part).strip() for part in symptoms)):
-        found = re.sub(r"[^a-z]+", " ", symptom.lower()).split()
-        length = min(3, len(found) - 1)  # one word may be a name
-        runs = [" ".join(found[i:i + length]) for i in range(len(found) - length + 1)]
-        if not any(f" {run} " in f" {code} " for run in runs):
-            unknown.append(symptom)
-    assert unknown == []

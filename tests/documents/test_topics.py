@@ -9,7 +9,6 @@ import pytest
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.system.layout import published_keys
-from rampart.actors.system.members import load_class
 from rampart.actors.system.topics import own_topics, system_topics
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import markdown, uses
@@ -30,32 +29,14 @@ def test_every_topic_that_a_node_reads_is_published_by_somebody():
               if use.readers and use.publishers == ("tools",)]
     ends = ftm_topics.PROGRAM_END.key  # of commands, of which this system has none
     assert sorted(lonely) == sorted([topics.WAY_OUT.key, topics.OBSTACLE.key, ends])
-
-
-def test_ground_truth_is_read_by_no_node_of_the_controller():
-    truth = next(u for u in uses(systems.load(None)) if u.topic is topics.TRUTH)
-    assert truth.readers == ("observer",)
-
-
-@pytest.mark.parametrize("name", ["paper", "osmosis", "cell"])
-def test_whole_systems_have_the_common_topics_and_no_other(name):
-    assert system_topics(systems.load(str(system_file(name)))) == (
-        ftm_topics.ALL if name == "cell" else topics.ALL)
-
-
-def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
-    loaded = []
-    monkeypatch.setattr("rampart.actors.system.topics.load_class",
-                        lambda path: loaded.append(path) or load_class(path))
-    assert [own_topics(systems.load(str(system_file(name))))
-            for name in ("paper", "osmosis", "cell")] == [()] * 3
-    assert loaded == []
-    assert own_topics(systems.load(str(write_porter_system(tmp_path)))) == (LOAD, AXLE)
+    truth = next(use for use in uses(systems.load(None)) if use.topic is topics.TRUTH)
+    assert truth.readers == ("observer",), "no node of the controller reads the ground truth"
 
 
 def test_the_topics_of_a_robot_s_own_actors_follow_the_common_ones(tmp_path):
     spec = systems.load(str(write_porter_system(tmp_path)))
-    assert system_topics(spec)[-2:] == (LOAD, AXLE)
+    assert system_topics(systems.load(str(system_file("cell")))) == ftm_topics.ALL
+    assert own_topics(spec) == system_topics(spec)[-2:] == (LOAD, AXLE)
     assert set(topics.ALL) <= set(system_topics(spec))
     assert set(published_keys(spec)) >= {"porter/load", "porter/axle/front", "porter/axle/rear"}
     used = {use.topic.key: (use.publishers, use.readers) for use in uses(spec)}

@@ -24,7 +24,6 @@ from rampart.files.plain_text import one_line, printable
 from rampart.files.streams import complain
 from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S
-from tests.fuzz.handler_fuzz import system
 from tests.fuzz.message_extremes import TEXTS, all_topics, filled
 
 HOSTILE = ("\x1b[2J\x1b]0;owned\x07", "a\nb", "a\r\x1b[1A[   0.00 s] UNSAFE: forged", "\x9b31m",
@@ -121,13 +120,3 @@ def test_a_flood_of_other_news_does_not_hide_that_the_robot_is_unsafe():
     console.take(topics.TRUTH, truth, Header("simulator", 1, 1, 3.0))
     lines = stream.getvalue().splitlines()
     assert (len(lines), lines[-1]) == (LINES_PER_S + 1, "[   3.00 s] UNSAFE:  1 collisions")
-
-
-def test_in_virtual_time_every_line_is_shown():
-    of = system("paper")
-    stream = io.StringIO()
-    console = MissionConsole(stream, lambda: 0.0)
-    console.banner("a mission", of.plan, of.run.system, virtual=True)
-    for number in range(1000):
-        console.line(float(number), "line")
-    assert len(stream.getvalue().splitlines()) == 1001

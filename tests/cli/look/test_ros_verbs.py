@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import datetime as dt
 import json
+import re
 import socket
 import threading
 import time
@@ -113,27 +114,20 @@ def test_a_robot_that_fits(capsys, system, mode):
     assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
 
 
-@pytest.mark.parametrize(("robot", "distribution", "why"), [
-    ({"publishes": "std_msgs/msg/String"}, "jazzy",
-     "/odom: /base has the type std_msgs/msg/String; expected nav_msgs/msg/Odometry"),
-    ({"distribution": "humble"}, "jazzy", "another definition of nav_msgs/msg/Odometry"),
-    ({"distribution": "humble"}, "jazzy", "'humble' has this definition"),
-    ({"distribution": "jazzy"}, "humble", "'jazzy'")])
-def test_a_robot_that_does_not_fit(capsys, system, robot, distribution, why):
+@pytest.mark.parametrize(("robot", "what", "words"), [
+    ({"publishes": "std_msgs/msg/String"}, "subscribe /odom",
+     ["/odom: /base has the type std_msgs/msg/String; expected nav_msgs/msg/Odometry"]),
+    ({"distribution": "humble"}, "subscribe /odom",
+     ["another definition of nav_msgs/msg/Odometry", "'humble' has this definition"]),
+    ({"domain": 5}, "graph",
+     ["no node in domain 0: ROS_DOMAIN_ID is 5 on the robot"])])
+def test_a_robot_that_does_not_fit(capsys, system, robot, what, words):
     port = free_port()
     with Robot(port, **robot):
-        code, found = checked(capsys, system(port, distribution))
-    assert code == 1
-    assert found["subscribe /odom"][0] is False
-    assert why in found["subscribe /odom"][1]
-
-
-def test_a_robot_in_another_domain(capsys, system):
-    port = free_port()
-    with Robot(port, domain=5):
         code, found = checked(capsys, system(port))
-    assert code == 1
-    assert found["graph"] == (False, "no node in domain 0: ROS_DOMAIN_ID is 5 on the robot")
+    assert (code, found[what][0]) == (1, False)
+    for word in words:
+        assert word in found[what][1]
 
 
 def test_another_node_publishes_than_the_named_one(capsys, tmp_path, system):
@@ -177,25 +171,24 @@ def test_an_access_rule_of_the_router_is_named(capsys, system, denied, what, why
     assert all(found[other][0] for other in others)
 
 
-@pytest.mark.parametrize(("backlog", "why"), [
-    (0, "no answer; the machine is off, or a firewall drops packets"),  # the kernel drops packets
-    (50, "a program listens there, but not a router of Zenoh without TLS")])
-def test_a_machine_and_a_program_that_do_not_answer(capsys, system, backlog, why):
-    silent = socket.socket()
-    silent.bind(("127.0.0.1", 0))
-    silent.listen(backlog)
-    with silent:
-        _, found = checked(capsys, system(silent.getsockname()[1]))
-    assert why in found["router of gateway"][1]
+def test_machines_programs_and_names_that_do_not_answer(capsys, system, refused):
+    def why(path) -> str:
+        code, found = checked(capsys, path)
+        assert (code, list(found)) == (1, ["router of gateway"])
+        return found["router of gateway"][1]
 
-
-def test_a_name_that_no_machine_has(capsys, system):
+    assert "no router of ROS 2 at tcp/127.0.0.1:1" in why(system(1))
+    for backlog, words in (
+            (0, "no answer; the machine is off, or a firewall drops packets"),  # the kernel drops
+            (50, "a program listens there, but not a router of Zenoh without TLS")):
+        with socket.socket() as silent:
+            silent.bind(("127.0.0.1", 0))
+            silent.listen(backlog)
+            assert words in why(system(silent.getsockname()[1]))
     path = Path(system(7447))
     path.write_text(path.read_text().replace("127.0.0.1", "no-robot.invalid"))
-    _, found = checked(capsys, path)
-    assert "no-robot.invalid:7447: " in found["router of gateway"][1]
-    assert "not known" in found["router of gateway"][1] or "resolution" in (
-        found["router of gateway"][1])
+    assert re.search(r"no-robot\.invalid:7447: .*(not known|resolution)", why(path))
+    assert "paper has no [[ros2]]" in refused("ros2", "check", "--system", "paper")
 
 
 @pytest.fixture
@@ -273,25 +266,11 @@ def test_rules_of_a_router_by_the_name_in_the_certificate(capsys, credentials, s
     ("tcp", shown(), "connect 'tcp/127.0.0.1:1': expected 'tls/…' with tls"),
     ("tls", ', tls = { ca = "ca.pem", key = "key.pem" }', "certificate and key: expected both"),
     ("tls", ', tls = { ca = "none.pem" }', "none.pem': No such file"),
-    ("tls", ', tls = { ca = "guarded.toml" }', "guarded.toml': NO_CERTIFICATE_OR_CRL_FOUND"),
-    ("tls", ', tls = { ca = "robot-ca.pem", certificate = "x", key = "x" }', "x': No such file"),
     ("tls", ', tls = { ca = "robot-ca.pem", certificate = "robot-ca.pem", key = "robot-ca.pem" }',
-     "robot-ca.pem': [SSL] PEM"),
-    ("tls", ', tls = { CA = "ca.pem" }', "CA")])
+     "robot-ca.pem': [SSL] PEM")])
 @pytest.mark.usefixtures("credentials")
 def test_files_and_endpoints_that_do_not_fit_are_refused(refused, system, protocol, more, why):
     assert why in refused("ros2", "check", "--system", system(1, protocol=protocol, more=more))
-
-
-def test_without_a_router_it_is_said_once(capsys, system):
-    code, found = checked(capsys, system(1))
-    assert code == 1
-    assert list(found) == ["router of gateway"]
-    assert "no router of ROS 2 at tcp/127.0.0.1:1" in found["router of gateway"][1]
-
-
-def test_a_system_without_ros_2_is_refused(refused):
-    assert "paper has no [[ros2]]" in refused("ros2", "check", "--system", "paper")
 
 
 def test_a_type_that_is_not_known_is_refused(capsys, system):

@@ -18,7 +18,6 @@ from rampart.actors.osmosis.control.mission.mission_state import MissionState, o
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.run_context import RunContext
-from rampart.cli.main import main
 from tests.cli.test_verbs_live import Run, running
 
 GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
@@ -74,14 +73,6 @@ async def test_without_an_answer_the_verb_says_so(run, monkeypatch):
     code, out, err = await run.call("mission", "pause")
     assert (code, out) == (1, "")
     assert err == "rampart: no effect: the Mission Manager did not answer within 0.5 s\n"
-
-
-@pytest.mark.parametrize("arguments", [["mission"], ["mission", "stop"], ["mission", "pause", "x"]])
-def test_an_order_that_there_is_not_is_bad_usage(arguments, capsys):
-    with pytest.raises(SystemExit) as end:
-        main(arguments)
-    assert end.value.code == 2
-    assert "usage: rampart" in capsys.readouterr().err
 
 
 def test_the_status_offers_exactly_the_orders_that_are_then_obeyed():
