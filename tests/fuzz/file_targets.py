@@ -104,7 +104,7 @@ def graph(data: bytes) -> None:
     load_airport(written("foreign/field.graph", data))
 
 
-@target("mask", refuses=(AirportError,), form="png", one_line=True,
+@target("mask", refuses=(AirportError,), one_line=True,
         samples=lambda: [_image("PNG"), _image("PNG", "P"), _image("PNG", "RGBA"),
                          _image("JPEG")])
 def mask(data: bytes) -> None:

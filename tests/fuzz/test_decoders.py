@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from functools import cache
 
 import pytest
@@ -52,15 +53,9 @@ def test_every_corpus_has_its_target():
 
 
 def hang(_data):
-    while True:
-        pass
-
-
-def hang_and_catch(data):
-    try:
-        hang(data)
-    except Exception:
-        return
+    with contextlib.suppress(Exception):
+        while True:
+            pass
 
 
 def refuse_in_two_lines(_data):
@@ -69,7 +64,7 @@ def refuse_in_two_lines(_data):
 
 @pytest.mark.parametrize(("run", "finding"), [
     ({}.__getitem__, KeyError), (refuse_in_two_lines, UnsoundError), (hang, SlowError),
-    (hang_and_catch, SlowError), (lambda _data: bytearray(1 << 30), MemoryError)])
+    (lambda _data: bytearray(1 << 30), MemoryError)])
 def test_unexpected_errors_long_times_and_much_memory_are_findings(
         run, finding, monkeypatch, tmp_path):
     monkeypatch.setattr(target, "LIMIT_S", 0.1)
@@ -78,12 +73,3 @@ def test_unexpected_errors_long_times_and_much_memory_are_findings(
     with pytest.raises(finding):
         decoder.try_input(b"abc")
     bytearray(600 << 20)
-
-
-def test_an_input_is_written_down_before_it_runs_since_it_may_end_the_process(
-        monkeypatch, tmp_path):
-    monkeypatch.setattr(target, "LAST", tmp_path)
-    written = []
-    Target("sick", lambda _data: written.append((tmp_path / "sick").read_bytes()), (), list,
-           "binary", (), one_line=True).try_input(b"abc")
-    assert written == [b"abc"]

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import topics
-from rampart.actors.runtime.actor import Actor, on
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.testing import VirtualSystem, run
 from tests.fuzz.handler_fuzz import Machine, cases, fuzz_actor, fuzz_tools, system
@@ -35,27 +33,6 @@ def test_every_tool_shows_any_message_that_its_type_allows(data):
     fuzz_tools(data.draw)
 
 
-def test_a_message_that_ends_an_actor_is_a_finding(monkeypatch):
-    class Brittle(Actor):
-        @on(topics.POSE)
-        def pose(self, message, _header):
-            if not abs(message.x_m) < 1e9:
-                raise ArithmeticError("not a position")
-
-    of = system("paper")
-    member = type(of.layout.members["localization"])("localization", Brittle, {})
-    monkeypatch.setattr(of.layout, "members", {**of.layout.members, "localization": member})
-
-    @settings(max_examples=1000, database=None, phases=[Phase.generate],
-              suppress_health_check=list(HealthCheck))
-    @given(st.data())
-    def fuzz(data):
-        fuzz_actor(of, "localization", data.draw)
-
-    with pytest.raises(ArithmeticError, match="not a position"):
-        fuzz()
-
-
 def heard_by_the_supervisor(*bodies):
     """Return the contexts of what a supervisor reports when it is told of changed systems."""
     of = system("paper")
@@ -76,7 +53,7 @@ def heard_by_the_supervisor(*bodies):
 
 
 @pytest.mark.parametrize("document", [
-    "[]", "null", "1", "true", "{", "", "{}", '"a"', '{"node": 3}', '{"node": [[]]}',
+    "null", "{", "{}", '{"node": 3}', '{"node": [[]]}',
     "[" * 300_000, '{"a":' * 50_000,
     '{"name": "x", "node": [{"name": "' + "n" * 100_000 + '"}]}'], ids=lambda text: text[:15])
 def test_a_changed_system_that_is_no_document_is_reported_and_the_supervisor_goes_on(document):
