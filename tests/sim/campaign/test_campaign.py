@@ -228,11 +228,10 @@ def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_keeps_what_was_f
     store.close()
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a chart")])
 def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
-        tmp_path, made_up, monkeypatch, capsys, error):
+        tmp_path, made_up, monkeypatch, capsys):
     def broken(*_):
-        raise error
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(campaigning, "write_campaign_report", broken)
     lost = with_content(full_jobs())[0]
@@ -241,14 +240,6 @@ def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
     told = capsys.readouterr()
     assert len(json.loads(told.out)) == 12
     assert told.err.splitlines()[-1].startswith(f"rampart: report: {tmp_path}: ")
-
-
-def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert rampart(["campaign", "--paper", "--out", str(tmp_path / "file" / "out")]) == 2
-    assert capsys.readouterr().err == (
-        f"rampart: {tmp_path / 'file' / 'out'}: no directory that can be written "
-        "(Not a directory)\n")
 
 
 # ---- what is counted -------------------------------------------------------------------------
@@ -268,31 +259,24 @@ def test_the_interval_is_wilsons():
     assert rate(0, 10).high == pytest.approx(0.2775, abs=1e-4)
     assert (rate(5, 10).low, rate(5, 10).high) == pytest.approx((0.2366, 0.7634), abs=1e-4)
     assert (rate(0, 0).low, rate(0, 0).high) == (0.0, 1.0)
-    assert (rate(2000, 2000).low, rate(2000, 2000).high) == pytest.approx((0.99808, 1.0), abs=1e-5)
 
 
-def test_a_run_without_effect_is_not_counted_as_survived():
-    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
-    row, = table(runs_of(result(), result(outcomes=nothing), result(safe=False, success=False),
-                         result(success=False, detected_after_s=None)))
-    assert (row.runs, row.ineffective) == (4, 1)
-    assert (row.safe.count, row.safe.of, row.success.count) == (2, 3, 1)
-    assert (row.worst, row.undetected, row.stopped_for_good) == ("fail, unsafe", 1, 1)
-    row, = table(runs_of(result(outcomes=nothing)))
-    assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
-
-
-@pytest.mark.parametrize(("ended", "success", "safe", "words"), [
-    ({"safe": False, "severity": 1.0}, 2, 1, "success, unsafe"),
-    ({"success": False}, 1, 2, "fail, safe")])
-def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_changed_nothing(
-        ended, success, safe, words):
+@pytest.mark.parametrize(("ended", "ineffective", "success", "safe", "words"), [
+    ({"safe": False, "severity": 1.0}, 0, (2, 2), (1, 2), "success, unsafe"),
+    ({"success": False}, 0, (1, 2), (2, 2), "fail, safe"),
+    ({}, 1, (1, 1), (1, 1), "success, safe")])
+def test_a_run_whose_fault_changed_nothing_has_not_survived_but_counts_if_it_ends_badly(
+        ended, ineffective, success, safe, words):
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
     row, = table(runs_of(result(), result(outcomes=nothing, detected_after_s=None, **ended)))
-    assert (row.runs, row.ineffective, row.worst) == (2, 0, words)
-    assert (row.success.count, row.success.of, row.safe.count, row.safe.of) == (
-        success, 2, safe, 2)
+    assert (row.runs, row.ineffective, row.worst) == (2, ineffective, words)
+    assert (row.success.count, row.success.of) == success
+    assert (row.safe.count, row.safe.of) == safe
     assert row.undetected == 0, "nothing to detect"
+    row, = table(runs_of(result(outcomes=nothing)))
+    assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
+    row, = table(runs_of(result(success=False, detected_after_s=None)))
+    assert (row.undetected, row.stopped_for_good) == (1, 1)
 
 
 def test_a_row_names_who_detected_first_and_which_expected_module_stayed_idle():
@@ -304,11 +288,10 @@ def test_a_row_names_who_detected_first_and_which_expected_module_stayed_idle():
 
 
 def test_the_worst_run_is_unsafe_before_failed_before_close():
-    close, failed, unsafe = (
-        result(margins={"obstacle_m": 0.1}), result(success=False), result(safe=False))
-    runs = runs_of(result(), close, failed, unsafe)
+    runs = runs_of(result(), result(margins={"obstacle_m": 0.1}), result(success=False),
+                   result(safe=False))
     assert sorted(runs, key=badness) == runs
-    assert worst(runs).result is unsafe
+    assert worst(runs) is runs[-1]
 
 
 def test_conditions_are_rows_of_their_own():
@@ -342,22 +325,6 @@ def test_every_row_of_the_papers_tables_is_run_under_every_condition():
     assert not any(c.agrees for c in found if c.fault == "command not updated")
 
 
-@pytest.mark.parametrize(("ended", "ours", "counts"), [
-    ({}, "success, safe", (1, 3, 3)), ({"safe": False}, "success, unsafe", (0, 4, 3))])
-def test_in_the_papers_tables_a_run_without_effect_has_not_survived_but_an_unsafe_one_counts(
-        ended, ours, counts):
-    jobs = [job for job in full_jobs()
-            if job.row == "command not updated" and not job.options["obstacles"]]
-    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
-    cell, = cells([Run(job, result(outcomes=nothing, **ended) if job is jobs[2] else result())
-                   for job in jobs])
-    assert (cell.runs, cell.ours) == (len(jobs), ours)
-    assert (cell.ineffective, cell.success, cell.safe) == counts
-    cell, = cells([Run(job, result(outcomes=nothing)) for job in jobs])
-    assert (cell.ineffective, cell.success, cell.safe, cell.ours, cell.agrees) == (
-        4, 0, 0, "no effect", False)
-
-
 def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy():
     def what_goes_wrong(job: Job) -> tuple[object, ...]:
         return job.row, job.faults, job.options, job.seed, job.network
@@ -370,18 +337,6 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
         assert [what_goes_wrong(j) for j in jobs] == [
             what_goes_wrong(j) for j in paper_jobs("B", seed=5) if condition_of(j) == condition]
     assert {j.system for j in full_jobs(system="other.toml")} == {"other.toml"}
-
-
-def test_of_the_full_system_success_and_safety_are_expected_where_the_paper_has_failure():
-    runs = [Run(job, result(success=job.row != "control node crash" or job.seed != 3,
-                            safe=job.faults[:1] != (PlannedFault("kill:hmi", 8.0),)))
-            for job in full_jobs()]
-    found = cells(runs)
-    assert [(c.fault, c.obstacles) for c in found] == [(f, n) for f in FAULTS for n in (0, 2)]
-    assert [c.paper for c in found] == [v for verdicts in WITH_FTM.values() for v in verdicts]
-    assert {c.expected for c in found} == {"success, safe"}
-    assert {(c.fault, c.ours) for c in found if not c.agrees} == {
-        ("control node crash", "fail, safe"), ("non-control node crash", "success, unsafe")}
 
 
 # ---- the search for the unsafe ---------------------------------------------------------------
@@ -451,6 +406,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
     (("--runs", "3", "--patience", "0"), "--patience 0"),
     (("--replay", "ab"), "expected --out DIR"),
+    (("--paper", "--out", "/dev/null/out"), r"no directory that can be written \(Not a directory"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
     (("--system", str(CELL), "--paper"), "--system .*cell.toml: expected a system with"),
 ])
@@ -486,11 +442,11 @@ def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
     listed = json.loads(capsys.readouterr().out)["topic"]
     assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
     (tmp_path / "NEAR.miss").write_text("x=-28.5,y=4,taxi=1\n")
-    assert rampart([*own, "--fault", "drop:porter/*@2+1", "--obstacles", "0", "--jobs", "1",
+    assert rampart([*own, "--fault", "drop:porter/load@2+1", "--obstacles", "0", "--jobs", "1",
                     "--mission", str(tmp_path / "NEAR.miss"), "--out", str(tmp_path / "out"),
                     "--json"]) == 0
-    assert {row["fault"]: row["ineffective"] for row in json.loads(capsys.readouterr().out)} == {
-        "drop:porter/load": 0, "drop:porter/axle/front": 1, "drop:porter/axle/rear": 1}
+    row, = json.loads(capsys.readouterr().out)
+    assert (row["fault"], row["ineffective"]) == ("drop:porter/load", 0)
 
 
 @pytest.fixture

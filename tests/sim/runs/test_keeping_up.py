@@ -54,15 +54,12 @@ def test_it_is_said_while_it_runs_with_node_and_world_and_not_too_often():
     assert len(lines) == pytest.approx(50 / LINE_S, abs=3)
 
 
-def test_a_hiccup_is_told_and_does_not_lower_the_rate():
+def test_a_hiccup_is_told_and_does_not_lower_the_rate_and_a_short_run_has_a_figure_too():
     kept, lines = run([0.0] * 20 + [0.9] + [0.0] * 40)
     assert len(lines) == 1
     assert (kept.with_rate, kept.late_s) == (1.0, 0.9)
     assert kept.behind_s == pytest.approx(WINDOW_S)
-
-
-def test_a_run_that_is_over_before_a_window_is_full_has_a_figure_too():
-    kept, _ = run([0.6], 4.0)
+    kept, _ = run([0.6], 4.0)  # over before a window is full
     assert (kept.with_rate, kept.late_s) == (pytest.approx(1.0), 0.6)
 
 

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from rampart.actors.runtime.run_plan import RunPlan
+from rampart.sim.runs import resumption
 from rampart.sim.runs.resumption import (
     MANIFEST,
     Manifest,
@@ -99,25 +100,21 @@ def test_any_cut_or_wrong_byte_of_a_manifest_is_one_line_or_harmless(tmp_path, s
             assert "\n" not in told
 
 
-def test_a_run_that_lives_is_not_resumed_though_its_launcher_is_gone(tmp_path, system):
+def test_a_run_that_lives_is_not_resumed_and_one_that_is_just_ending_is_waited_for(
+        tmp_path, system, monkeypatch):
     """Any process of the run keeps the lock, for it was forked with it."""
     files = begun(tmp_path / "reports", "a", system)
     assert files.lock()
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"],
                              pass_fds=[files._lock])
     files.unlock()
+    monkeypatch.setattr(resumption, "_PATIENCE_S", 0.2)
     with pytest.raises(ResumptionError, match="still lives"):
         find(tmp_path / "reports", "a")
     child.kill()
     child.wait()
-    found, _ = find(tmp_path / "reports", "a")
-    found.unlock()
-
-
-def test_processes_that_are_just_ending_are_waited_for(tmp_path, system, monkeypatch):
-    living = begun(tmp_path / "reports", "a", system)
-    assert living.lock()
-    monkeypatch.setattr(time, "sleep", lambda _s: living.unlock())
+    assert files.lock()
+    monkeypatch.setattr(time, "sleep", lambda _s: files.unlock())
     found, _ = find(tmp_path / "reports", "a")
     found.unlock()
 
@@ -138,10 +135,13 @@ def test_another_system_seed_or_mission_is_named_and_another_rate_is_none_of_the
     assert f"{system} has changed" in differences(before, manifest(system))
 
 
-def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
+def test_of_two_memories_the_newest_sound_one_is_recalled_until_the_run_has_ended(
+        tmp_path, system):
     files, recalled = RunFiles(tmp_path), list[bytes]()
 
     def recall(memory: bytes) -> float:
+        if memory == b"\xc1":
+            raise msgspec.ValidationError("Expected `object`")
         recalled.append(memory)
         return 7.0
 
@@ -149,7 +149,8 @@ def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
     for memory in (b"first", b"second", b"third"):
         files.keep_memory("r", memory)
     assert files.recall("r", recall) == (7.0, [])
-    before, newest = sorted(tmp_path.iterdir(), key=lambda file: file.read_bytes()[-5:])
+    before, newest = sorted(
+        tmp_path.glob("record-*"), key=lambda file: file.read_bytes()[-5:])
     newest.write_bytes(newest.read_bytes()[:-1])
     time_s, problems = files.recall("r", recall)
     assert (time_s, len(problems)) == (7.0, 1)
@@ -157,13 +158,12 @@ def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
     before.write_bytes(b"")
     time_s, problems = files.recall("r", recall)
     assert (time_s, len(problems)) == (0.0, 2)
-
-
-def test_a_run_that_has_ended_leaves_no_memory_and_keeps_its_manifest(tmp_path, system):
-    files = RunFiles(tmp_path)
-    files.keep_memory("r", b"memory")
+    for _ in range(2):
+        files.keep_memory("r", b"\xc1")  # whole, but not a record of this run
+    time_s, problems = files.recall("r", recall)
+    assert (time_s, len(problems)) == (0.0, 2)
     files.end(manifest(system))
-    assert files.recall("r", lambda _memory: 7.0) == (0.0, [])
+    assert files.recall("r", recall) == (0.0, [])
     assert files.manifest() == manifest(system)
 
 
@@ -178,13 +178,3 @@ def test_a_run_that_did_not_start_leaves_the_one_before_it_as_it_was(tmp_path, s
         else:
             assert files.manifest() == before
             (files.directory / MANIFEST).unlink()
-
-
-def test_a_memory_that_is_none_of_this_run_s_record_is_damage(tmp_path):
-    files = RunFiles(tmp_path)
-    files.keep_memory("r", b"\xc1")
-
-    def recall(_memory: bytes) -> float:
-        raise msgspec.ValidationError("Expected `object`")
-
-    assert files.recall("r", recall)[0] == 0.0

@@ -32,19 +32,13 @@ def going(distance_m: float) -> ControlStatus:
     return ControlStatus("m1", 0, ControlPhase.FOLLOWING, 0, distance_m)
 
 
-def test_a_mission_that_succeeded_ends_the_run_once_the_robot_has_settled():
-    end = RunEnd(60.0)
-    end.mission(mission(MissionPhase.RUNNING), 1.0)
-    end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
-    assert end.ended(9.0 + SETTLE_S - 0.1) is None
-    assert end.ended(9.0 + SETTLE_S) == "mission succeeded"
-
-
-def test_a_robot_that_drives_on_after_its_mission_is_watched_until_it_stands_or_for_a_minute():
+def test_a_robot_is_watched_after_its_mission_until_it_stands_or_for_a_minute():
     for twist in (Twist(0.3, 0.0), Twist(0.0, -0.5)):
         end = RunEnd(60.0)
         end.mission(mission(MissionPhase.RUNNING), 1.0)
         end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
+        assert end.ended(9.0 + SETTLE_S - 0.1) is None
+        assert end.ended(9.0 + SETTLE_S) == "mission succeeded"
         end.truth(twist, 20.0)
         assert end.ended(20.0) is None
         end.truth(STANDS, 21.0)
@@ -100,21 +94,20 @@ def test_a_mission_that_a_recovery_holds_to_the_end_says_which():
     assert end.ended(10.1) == "no progress for 10 s: mission paused, held by RM1: DM1: lost"
 
 
-def test_a_run_whose_mission_the_operator_starts_waits_for_it_and_then_is_like_any_other():
+def test_a_mission_of_the_operator_is_waited_for_and_one_that_nobody_takes_or_a_lost_world_is_not():
     end = RunEnd(10.0, waits=True)
     assert end.ended(10_000.0) is None
     end.mission(mission(MissionPhase.RUNNING), 10_000.0)
     assert end.ended(10_009.9) is None
     assert end.ended(10_010.1) == "no progress for 10 s"
-
-
-def test_a_mission_nobody_takes_ends_the_run_and_a_world_that_is_gone_is_noticed():
     assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
     assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
-    end = RunEnd(100.0, waits=True)
-    end.truth(STANDS, 2.0)
-    assert end.world_gone(2.0 + WORLD_LATE_S) == ""
-    assert "the world is gone" in end.world_gone(2.1 + WORLD_LATE_S)
+    late = RunEnd(60.0, begins_s=500.0)  # a part of a resumed run
+    assert late.ended(529.0) is None
+    assert "no mission was accepted" in str(late.ended(532.0))
+    end.truth(STANDS, 10_012.0)
+    assert end.world_gone(10_012.0 + WORLD_LATE_S) == ""
+    assert "the world is gone" in end.world_gone(10_012.1 + WORLD_LATE_S)
 
 
 def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_anew():
@@ -144,10 +137,3 @@ def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
     end.control(going(20.0), 35.0)
     assert end.ended(60.0) is None
     assert end.ended(76.0) == "no progress for 40 s"
-
-
-def test_a_part_that_begins_late_has_the_patience_of_one_that_begins_at_zero():
-    end = RunEnd(60.0, begins_s=500.0)
-    assert end.ended(501.0) is None
-    assert end.ended(529.0) is None
-    assert "no mission was accepted" in str(end.ended(532.0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 
 import pytest
 from hypothesis import given
@@ -20,16 +19,6 @@ def run(scenario):
         return runner.run(scenario())
 
 
-def test_an_hour_passes_at_once_and_to_the_second():
-    async def scenario():
-        await asyncio.sleep(3600)
-        return asyncio.get_running_loop().time()
-
-    started = time.monotonic()
-    assert run(scenario) == 3600.0
-    assert time.monotonic() - started < 3600
-
-
 def test_timeouts_threads_and_queues_of_asyncio_work_on_it():
     async def scenario():
         with pytest.raises(TimeoutError):
@@ -39,9 +28,10 @@ def test_timeouts_threads_and_queues_of_asyncio_work_on_it():
         asyncio.get_running_loop().call_later(3, queue.put_nowait, 7)
         assert await asyncio.wait_for(queue.get(), 10) == 7
         assert await asyncio.to_thread(lambda: 42) == 42
+        await asyncio.sleep(3600)  # an hour passes at once and to the second
         return asyncio.get_running_loop().time()
 
-    assert run(scenario) == 8.0
+    assert run(scenario) == 3608.0
 
 
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.0]) | st.floats(0, 2), st.booleans()),
@@ -91,7 +81,11 @@ def test_what_was_withdrawn_is_not_called_and_the_rest_keeps_its_order(calls):
         for i, (when, kept) in enumerate(calls):
             loop.post_at(when, stays if kept else goes, when, i)
         loop.call_at(1.0, stays, 1.0, len(calls))
+        for call in (loop.call_later(50, goes, 0, 0), loop.call_soon(goes, 0, 0)):
+            call.cancel()
+            assert call.cancelled()
         await asyncio.sleep(3)
+        assert loop.time() == 3.0  # what was cancelled costs no time
         return seen
 
     kept = [(when, i) for i, (when, kept) in enumerate(calls) if kept]
@@ -137,18 +131,6 @@ def test_a_virtual_clock_shows_what_a_clock_of_the_same_loop_shows():
         assert lean.source_time(5.1) == plain.source_time(5.1)
 
     run(scenario)
-
-
-def test_what_is_cancelled_is_not_called_and_costs_no_time():
-    async def scenario():
-        loop, seen = asyncio.get_running_loop(), []
-        for call in (loop.call_later(50, seen.append, "late"), loop.call_soon(seen.append, "now")):
-            call.cancel()
-            assert call.cancelled()
-        await asyncio.sleep(1)
-        return seen, loop.time()
-
-    assert run(scenario) == ([], 1.0)
 
 
 def test_files_are_served_while_time_stands_still():

@@ -33,9 +33,6 @@ def test_over_one_link_nothing_is_lost_nothing_comes_twice_and_nothing_overtakes
         assert all(len(at) == 1 for at in arrivals)
         times = [at[0] for at in arrivals]
         assert times == sorted(times)
-
-
-def test_no_message_arrives_before_it_was_sent():
     for model in NETWORKS.values():
         assert all(at >= sent for sent, found in ways(SeededNetwork(model, 4)) for at in found)
 
