@@ -9,37 +9,26 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.detection.freshness import Freshness
-from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
-from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
-from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
-from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
-from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, every
-from rampart.manager.actor import FtmManager
+from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.detection.lane import LANE
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
-from tests.osmosis_system import COMMAND, POSE, System, shipped_system
+from tests.osmosis_system import System, shipped_system
 from tests.virtual_time import within
 
-CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
-OTHERS = ("hmi", "teleoperation")
-WATCH = {"DM4": CONTROL, "DM5": OTHERS, "DM7": ("localization",)}
-RESPAWN = {"RM3": CONTROL, "RM4": (*OTHERS, "localization")}
+NODES = ("mission_manager", "graph_planner", "osmosis_control", "hmi", "teleoperation",
+         "localization")
 
 
 class Robot(Actor):
@@ -67,21 +56,9 @@ class Whole(System):
 
     def __init__(self) -> None:
         super().__init__(system=shipped_system(), airport=LANE)
-        timing = shipped_system().timing
-        self.actors: dict[str, Actor] = {}
-        self.modules: dict[str, tuple[type[Actor], dict[str, Any]]] = {
-            "DM1": (ProhibitedArea, {"margin_m": 0.6}),
-            "DM2": (Freshness, {**COMMAND, "timeout_s": timing.command_timeout_s}),
-            "DM3": (Bounds, {}),
-            "DM6": (Freshness, {**POSE, "timeout_s": timing.localization_timeout_s}),
-            **{name: (Watchdog, {"watch": watch, "timeout_s": timing.heartbeat_timeout_s})
-               for name, watch in WATCH.items()},
-            "RM1": (EmergencyStop, {}),
-            "RM2": (ControlledStop, {}),
-            **{name: (Respawn, {"nodes": nodes}) for name, nodes in RESPAWN.items()},
-            "RM5": (SwitchTeleoperation, {}),
-            "ftm_manager": (FtmManager, {}),
-        }
+        self.layout = Layout(self.run.plan, self.run.system, self.run.application)
+        spec = shipped_system()
+        self.modules = [*(row.name for row in (*spec.detections, *spec.recoveries)), "ftm_manager"]
 
     async def begin(self) -> None:
         """Start everything, and wait until all is known and well."""
@@ -92,18 +69,13 @@ class Whole(System):
         self.pilot = self.start("safety_pilot", Pilot)
         self.supervisor = self.start("supervisor", Supervisor)
         self.robot = self.start("robot", Robot)
-        self.nodes = {name: self.start(name, Node) for names in WATCH.values() for name in names}
+        for name in NODES:
+            self.start(name, Node)
         for name in self.modules:
-            self.revive(name)
+            self.start_node(name)
         await asyncio.sleep(1.0)
         assert self.decisions == []
         assert self.status.activated == ()
-
-    def revive(self, name: str) -> Actor:
-        """Start a module, or its next incarnation."""
-        cls, parameters = self.modules[name]
-        self.actors[name] = self.start(name, cls, **parameters)
-        return self.actors[name]
 
     @property
     def status(self) -> fm.ManagerStatus:
@@ -177,7 +149,7 @@ async def test_a_respawned_detection_module_does_not_let_go_of_a_fault_that_pers
     assert system.pilot.orders["RM2"].reason.startswith("DM2: command not updated")
     await system.kill("DM2")
     await asyncio.sleep(0.3)
-    system.revive("DM2")
+    system.start_node("DM2")
     for _ in range(60):
         await asyncio.sleep(0.05)
         assert system.pilot.mode is PilotMode.STOP
@@ -195,7 +167,7 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
     assert (request.node, request.failed_incarnation, request.by) == ("DM3", 1, "ftm_manager")
     assert system.status.silent == ("DM3",)
     await system.kill("DM3")
-    system.revive("DM3")
+    system.start_node("DM3")
     await asyncio.sleep(2.0)
     assert system.status.silent == ()
     hang(system.actors["DM3"])
@@ -214,7 +186,7 @@ async def test_a_respawned_manager_adopts_a_latched_emergency_stop(system, dies_
     system.robot.y_m = 0.0
     await asyncio.sleep(2.0)
     for name in ("ftm_manager", *dies_too):
-        system.revive(name)
+        system.start_node(name)
         await asyncio.sleep(0.3)
     for _ in range(100):
         await asyncio.sleep(0.05)

@@ -15,8 +15,7 @@ from tug import topics
 from tug.judge import Deliveries
 from tug.topics import Free, Goal, Motion, Place, Truth
 
-from rampart import DetectionState, Header, parse_specification, verify
-from rampart.actors.ftm.topics import DETECTION
+from rampart import Header, parse_specification, verify
 from rampart.testing import RealRun, VirtualSystem, run, table, virtual_run
 
 HERE = Path(__file__).resolve().parents[1]
@@ -27,26 +26,6 @@ SYSTEM = HERE / "tug.toml"
 def drive(*faults, ftm=True, seed=1):
     """Return what came of a run; the same one if asked again."""
     return virtual_run(SYSTEM, *faults, seed=seed, ftm=ftm)
-
-
-@pytest.mark.parametrize(("speed_mps", "free_m", "state"), **table({
-    "there is room": (0.8, 1.0, DetectionState.IDLE),
-    "0.12 m of latency and 0.128 m of braking": (0.8, 0.24, DetectionState.ACTIVE),
-    "just enough": (0.8, 0.25, DetectionState.IDLE),
-    "it stands": (0.0, 0.0, DetectionState.IDLE),
-}))
-def test_it_will_not_stop_in_time(speed_mps, free_m, state):
-    async def scenario():
-        async with VirtualSystem.load(SYSTEM) as system:
-            reports = system.hear(DETECTION)
-            system.start_node("D_CLOSE")
-            await system.settle()
-            system.say(topics.WHEELS, Motion(speed_mps, 0.0), source="world")
-            system.say(topics.FREE, Free(free_m, 0.5), source="world")
-            await asyncio.sleep(0.3)
-            assert reports[-1].message.state is state
-
-    run(scenario)
 
 
 def test_the_pilot_drives_no_faster_than_is_free_and_not_by_old_news():
@@ -62,21 +41,6 @@ def test_the_pilot_drives_no_faster_than_is_free_and_not_by_old_news():
                 assert drives[-1].message.speed_mps == pytest.approx(expected_mps)
             await asyncio.sleep(0.5)
             assert drives[-1].message == Motion(0.0, 0.0)
-
-    run(scenario)
-
-
-def test_the_mission_goes_on_where_the_process_before_was():
-    async def scenario():
-        async with VirtualSystem.load(SYSTEM) as system:
-            goals = system.hear(topics.GOAL)
-            for x_m in (1.0, 4.0):
-                system.start_node("mission")
-                await system.settle()
-                system.say(topics.POSE, Place(x_m, 0.9, 0.0, 0.5), source="localization")
-                await system.settle()
-                await system.kill("mission")
-            assert [heard.message.step for heard in goals] == [1, 1, 1]  # it receives the last pose
 
     run(scenario)
 
