@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable, Coroutine
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, TypeVar
 
 from rampart import systems
@@ -17,7 +15,8 @@ from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.page_plan import PagePlan
 from rampart.manager.spec.specification import SystemSpec, parse_specification
-from rampart.testing import VirtualSystem, run
+from rampart.testing import VirtualSystem
+from tests.virtual_time import Test, within
 
 A = TypeVar("A", bound=Actor)
 
@@ -59,24 +58,6 @@ class System(VirtualSystem):
         return actor
 
 
-Test = Callable[..., None]
-
-
-def in_system(**known: Any) -> Callable[[Callable[..., Coroutine[Any, Any, None]]], Test]:
+def in_system(**known: Any) -> Callable[[Test], Test]:
     """Make a test of a coroutine function, in virtual time; it gets a `System(**known)` first."""
-
-    def made(scenario: Callable[..., Coroutine[Any, Any, None]]) -> Test:
-        async def whole(**arguments: Any) -> None:
-            async with System(**known) as system:
-                await scenario(system, **arguments)
-
-        @functools.wraps(scenario)
-        def test(**arguments: Any) -> None:
-            run(lambda: whole(**arguments))
-
-        signature = inspect.signature(scenario)
-        test.__signature__ = signature.replace(  # type: ignore[attr-defined]
-            parameters=[*signature.parameters.values()][1:])
-        return test
-
-    return made
+    return within(partial(System, **known))

@@ -18,7 +18,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import (
     Goal,
-    Imu,
     LaserScan,
     MissionRequest,
     Mode,
@@ -88,13 +87,6 @@ def test_each_mode_changes_what_it_says_and_nothing_else(mode, fields, at_12, at
     assert faults.expire("i") == 2
     assert sent(faults, [14.0]) == [(14.0, 14.0, 0.0, 1)]
     assert faults.apply(KEY, POSE, 15.0, 15.0).body is POSE
-
-
-@pytest.mark.parametrize("mode", ["freeze", "stuck"])
-def test_what_freezes_before_its_first_message_repeats_that_one(mode):
-    faults = gate(mode)
-    assert [x for x, *_ in sent(faults, [10.0, 11.0, 12.0])] == [10.0, 10.0, 10.0]
-    assert faults.expire("i") == 2
 
 
 # -- which messages ----------------------------------------------------------------------------
@@ -193,13 +185,6 @@ def test_an_array_is_filled_ramped_and_biased_element_by_element(values, fill, r
         after = gate("corrupt", **fields).apply(KEY, before, 0.0, 10.0 + elapsed_s).body
         assert ranges(after).tolist() == expected.astype("<f4").tolist()
         assert after.range_max_m == before.range_max_m
-
-
-@given(yaw=st.floats(-math.pi, math.pi, exclude_min=True), bias=st.floats(-20.0, 20.0))
-def test_an_angle_stays_an_angle_whatever_is_added(yaw, bias):
-    moved = corrupted(Imu(yaw, 0.0, 0.0, 0.0), add_fields={"yaw_rad": bias}).yaw_rad
-    assert -math.pi < moved <= math.pi
-    assert math.remainder(moved - yaw - bias, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
 
 
 @given(st.floats())

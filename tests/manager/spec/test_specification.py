@@ -41,17 +41,6 @@ def test_the_shipped_system_is_the_papers():
     assert spec.build_fault_tree().top == "moving_inside_prohibited_area"
 
 
-def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
-    assert dict.fromkeys(paper().processes(), 1) == {
-        name: len(actors) for name, actors in paper().processes().items()}
-    assert len(paper().actors()) == 9 + 7 + 5
-    shared = parse_specification(edit((
-        'actor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"',
-         'actor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"\nprocess = "desk"'),
-        ('name = "teleoperation"', 'name = "teleoperation"\nprocess = "desk"')), FILE)
-    assert [n.name for n in shared.processes()["desk"]] == ["hmi", "teleoperation"]
-
-
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
 HMI = ('name = "hmi"\nactor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"\nkind = "non-control"\n'
        'respawn = "RM4"')
