@@ -225,13 +225,8 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
             say(f"{title}:")
             print_table(("fault", "detected by", "s", "effect"), rows)
             say()
-    say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
-    print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
-    say()
-    say(f"nonsense readings, as MODE:TOPIC; MODE is one of {', '.join(NONSENSE)}:")
-    print_table(("topic", "modes"), [
-        (key, ", ".join(nonsense)) for key in keys
-        if (nonsense := [mode for mode in modes_of(key, known) if mode in NONSENSE])])
+    say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}, or a nonsense reading:")
+    print_table(("topic", "modes", "nonsense"), _modes_by_topic(keys, known))
     say()
     others = [name for names in faults.others.values() for name in names]
     if others:
@@ -243,14 +238,17 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
         f"slow:NODE or slow:all in virtual time; NODE is one of {', '.join(can_be_hit(spec))}")
 
 
-def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dict[str, str]:
-    """Return key → modes in words, with one row for each family."""
-    rows: dict[str, str] = {}
+def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]
+                    ) -> list[tuple[str, str, str]]:
+    """Return topic, modes and nonsense readings in words, with one row for each family."""
+    rows: dict[str, tuple[str, str, str]] = {}
     for key in keys:
-        if modes := modes_of(key, known):
-            missing = [mode for mode in MODES if mode not in modes]
-            rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
-    return {topic.key: rows[topic.key] for topic in known if topic.key in rows}
+        modes, topic = modes_of(key, known), resolve(key, known)[0].key
+        missing = [mode for mode in MODES if mode not in modes]
+        if modes:
+            rows[topic] = (topic, f"all but {', '.join(missing)}" if missing else "all",
+                           ", ".join(mode for mode in NONSENSE if mode in modes))
+    return list(rows.values())
 
 
 # -- the work -----------------------------------------------------------------------------------

@@ -13,10 +13,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import os
-import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ros2.ros_nodes import GRAPH, RosGraphReport
 from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.cli import completion, systems
-from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings
 from rampart.cli.output import (
     NoEffectError,
@@ -36,7 +33,6 @@ from rampart.cli.output import (
     print_json,
     print_rows,
     say,
-    say_text,
     unknown,
 )
 from rampart.cli.robot_lines import RobotLines
@@ -47,8 +43,6 @@ from rampart.files.plain_text import printable
 from rampart.manager.spec.clearing import clearing_in_words
 
 MOST_LINES = 1_000_000
-_LONGEST_LINE = 1 << 16
-_LOOK_S = 0.1
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the slowest is published twice a second."""
 
@@ -61,8 +55,7 @@ def add(verbs: Any) -> None:
     add_verb(node, "log", "print the output of a node's command", node_log, PORT,
              option("name", metavar="NODE", help="a node with a command",
                     completer=completion.nodes),
-             whole("--lines", "N", "print the last N lines (default: 50)", 50),
-             flag("--follow", "then print new lines until the run ends"))
+             whole("--lines", "N", "print the last N lines (default: 50)", 50))
     add_verb(verbs, "top", "watch processes, topics and decisions", top, PORT,
              flag("--once", "print one picture and end"),
              flag("--json", "print one picture as JSON and end"),
@@ -100,7 +93,6 @@ def node_log(options: argparse.Namespace) -> int:
 
     Examples:
       rampart node log estimator
-      rampart node log estimator --follow
       rampart node log estimator --lines 1000 | less
     """
     between("--lines", options.lines, 0, MOST_LINES)
@@ -113,46 +105,18 @@ def node_log(options: argparse.Namespace) -> int:
         logs = sorted(log.stem for log in folder.glob("*.log"))
         raise NoEffectError(f"{options.name}: no command, or its output is not kept; nodes with "
                             f"output: {', '.join(logs) or 'none'}")
-    with contextlib.suppress(KeyboardInterrupt):
-        for text in tail(file, options.lines, (lambda: not is_over(run)) if options.follow
-                         else lambda: False):
-            say_text(text)
+    for line in last_lines(file, options.lines):
+        print(printable(line.decode(errors="replace").rstrip("\r\n"), keep="\t"), flush=True)
     return 0
 
 
-def tail(file: Path, lines: int, follows: Callable[[], bool]) -> Iterator[str]:
-    """Yield the last lines of a log, safe for a terminal, then the lines that are added.
-
-    Args:
-        file: the log; the previous one is `FILE.1`.
-        lines: number of lines.
-        follows: whether to wait for more.
-    """
-    before = file.with_name(f"{file.name}.1")
-    open_log = file.open("rb")
-    try:
-        ended = deque(open_log, maxlen=lines)
-        if len(ended) < lines:
-            with contextlib.suppress(FileNotFoundError), before.open("rb") as earlier:
-                ended.extendleft(reversed(deque(earlier, maxlen=lines - len(ended))))
-        yield from map(_shown, ended)
-        while follows():
-            more = open_log.readline(_LONGEST_LINE)
-            if more:
-                yield _shown(more)
-                continue
-            with contextlib.suppress(OSError):
-                if file.stat().st_ino != os.fstat(open_log.fileno()).st_ino:  # it was rotated
-                    rotated, open_log = open_log, file.open("rb")
-                    yield from map(_shown, rotated)
-                    rotated.close()
-            time.sleep(_LOOK_S)
-    finally:
-        open_log.close()
-
-
-def _shown(line: bytes) -> str:
-    return printable(line.decode(errors="replace").rstrip("\r\n"), keep="\t")
+def last_lines(file: Path, count: int) -> deque[bytes]:
+    """Return the last lines of a log, whose previous part is `FILE.1`."""
+    lines: deque[bytes] = deque(maxlen=count)
+    for part in (file.with_name(f"{file.name}.1"), file):
+        with contextlib.suppress(FileNotFoundError), part.open("rb") as opened:
+            lines.extend(opened)
+    return lines
 
 
 async def status(options: argparse.Namespace) -> int:
