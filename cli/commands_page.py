@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from rampart.actors.system.members import application_class
 from rampart.cli import run_options, systems
@@ -16,8 +15,6 @@ from rampart.cli.analyse import campaign_verb
 from rampart.cli.main import build_parser
 from rampart.cli.operate import kill_node
 from rampart.cli.output import rendered, say_text
-
-_WITHOUT_VALUE = (argparse._StoreTrueAction, argparse._StoreConstAction)
 
 
 def markdown() -> str:
@@ -40,52 +37,30 @@ def markdown() -> str:
 
 def _section(parser: argparse.ArgumentParser, name: str, level: int) -> Iterator[str]:
     yield f"{'#' * level} {name}\n"
-    yield from _prose(parser.description or "")
+    yield from _block(parser.description)
     family = next((a for a in parser._actions if isinstance(a, argparse._SubParsersAction)), None)
-    if rows := [_row(a) for a in parser._actions if a.help is not argparse.SUPPRESS
+    if rows := [_row(parser, a) for a in parser._actions if a.help is not argparse.SUPPRESS
                 and a is not family and "--help" not in a.option_strings]:
         yield "\n".join(("| option | meaning |", "|---|---|", *rows)) + "\n"
-    yield from _prose((parser.epilog or "").replace("examples:\n", "", 1))
+    yield from _block(parser.epilog)
     if family is not None:
         for listed in family._choices_actions:
             yield from _section(family.choices[listed.dest], f"{name} {listed.dest}", level + 1)
 
 
-def _row(action: Any) -> str:
-    value = action.metavar or ("" if action.option_strings else action.dest)
-    if action.choices and not action.metavar:
-        value = "{" + ",".join(map(str, action.choices)) + "}"
-    if isinstance(action, _WITHOUT_VALUE):
-        value = ""
-    elif action.nargs == "?":
-        value = f"[{value}]"
-    elif action.nargs == "*":
-        value = f"[{value} ...]"
-    elif action.nargs == "+":
-        value = f"{value} ..."
+def _row(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
+    value = parser._get_formatter()._format_args(
+        action, action.dest.upper() if action.option_strings else action.dest)
     what = f"{', '.join(action.option_strings)} {value}".strip()
-    return f"| `{_cell(what)}` | {_cell(action.help or '')} |"
+    return "| `{}` | {} |".format(what, (action.help or "").replace("|", "\\|"))
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
-def _prose(text: str) -> Iterator[str]:
-    """Yield the paragraphs of a help text; what is indented becomes a block of code."""
-    lines = text.strip("\n").splitlines()
-    while lines:
-        code = lines[0].startswith("  ")
-        end = next((i for i, line in enumerate(lines)
-                    if not line or line.startswith("  ") != code), len(lines))
-        block, lines = lines[:end], lines[end + (end < len(lines) and not lines[end]):]
-        if block and code:
-            yield "\n".join(("```", *(line[2:] for line in block), "```")) + "\n"
-        elif block:
-            text = "\n".join(block)
-            if text.startswith("exit code:"):
-                text = f"Exit code:{text.removeprefix('exit code:').removesuffix('.')}."
-            yield f"{text}\n"
+def _block(text: str | None) -> Iterator[str]:
+    shown = (text or "").strip("\n")
+    if "\n  " in shown:
+        yield f"```text\n{shown}\n```\n"
+    elif shown:
+        yield f"{shown}\n"
 
 
 if __name__ == "__main__":
