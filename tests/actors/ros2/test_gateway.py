@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import functools
-import inspect
+import tempfile
+from contextlib import asynccontextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -16,7 +17,8 @@ from rampart.actors.ros2.translation.types import SHIPPED
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
-from rampart.testing import Ear, VirtualSystem, run
+from rampart.testing import Ear, VirtualSystem
+from tests.virtual_time import within
 
 SYSTEM = """
 name = "guarded"
@@ -90,35 +92,28 @@ stop_after_s = 0.2
 """
 
 
-@pytest.fixture
-def guarded(tmp_path):
-    def write(more: str = "", base: str = SYSTEM):
-        path = tmp_path / "guarded.toml"
-        path.write_text(base + more)
-        return path
+@asynccontextmanager
+async def loaded(text):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "guarded.toml")
+        path.write_text(text)
+        async with VirtualSystem.load(path) as system:
+            yield system
 
-    return write
+
+def beside(more="", base=SYSTEM):
+    """Run a test in virtual time with a system beside ROS 2, which is its first argument."""
+    return within(lambda: loaded(base + more))
 
 
-def beside(more: str = "", base: str = SYSTEM):
-    """Make a test of a coroutine function, in virtual time; it gets a system beside ROS 2 first."""
-
-    def made(scenario):
-        async def whole(file, arguments):
-            async with VirtualSystem.load(file) as system:
-                await scenario(system, **arguments)
-
-        @functools.wraps(scenario)
-        def test(guarded, **arguments):
-            run(lambda: whole(guarded(more, base), arguments))
-
-        signature = inspect.signature(scenario)
-        test.__signature__ = signature.replace(parameters=[
-            inspect.Parameter("guarded", inspect.Parameter.POSITIONAL_OR_KEYWORD),
-            *[*signature.parameters.values()][1:]])
-        return test
-
-    return made
+def refusal(tmp_path, text):
+    """Return the line with which a system is refused before anything runs."""
+    path = tmp_path / "guarded.toml"
+    path.write_text(text)
+    plan = RunPlan(system_file=str(path))
+    with pytest.raises(ValueError, match=r"guarded\.toml: [^\n]+\Z") as raised:
+        Layout(plan, load_system(plan))
+    return str(raised.value)
 
 
 def start(system, *names):
@@ -544,8 +539,5 @@ async def test_without_a_router_the_nodes_are_unknown_and_none_is_accused(system
      "has no field 'sucess'"),
     ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\nbeside = "b"', "ros2[2].beside"),
 ])
-def test_a_table_that_cannot_be_is_refused_before_anything_runs(guarded, more, why):
-    plan = RunPlan(system_file=str(guarded(f"[[ros2]]\n{more}\n")))
-    with pytest.raises(ValueError, match=r"guarded\.toml: [^\n]+\Z") as raised:
-        Layout(plan, load_system(plan))
-    assert why in str(raised.value)
+def test_a_table_that_cannot_be_is_refused_before_anything_runs(tmp_path, more, why):
+    assert why in refusal(tmp_path, f"{SYSTEM}[[ros2]]\n{more}\n")
