@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import msgspec
@@ -11,8 +10,7 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.stand_in import StandIn
 from rampart.actors.runtime.actor import Actor, every
-from rampart.actors.runtime.parameters import TopicHeard, TopicPublished
-from rampart.files.streams import complain
+from rampart.actors.runtime.parameters import TopicPublished
 
 GOAL, GOAL_TYPE = "/navigate_to_pose", "nav2_msgs/action/NavigateToPose"
 ODOM_TYPE, TWIST_TYPE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
@@ -151,40 +149,3 @@ class Asker(Actor):
         """Ask."""
         topic = self.chosen_topic(self.parameters.topic)
         self.publish(topic, msgspec.convert(self.parameters.body, topic.type))
-
-
-class Screen(Actor):
-    """Writes how much was passed on."""
-
-    class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """What it hears."""
-
-        odometry: TopicHeard = "base/odometry"
-        answers: TopicHeard = "base/is_shut"
-        stops: TopicHeard = "base/stop"
-
-    parameters: Parameters
-
-    def __init__(self, context) -> None:
-        super().__init__(context)
-        said, self.counts = self.parameters, dict.fromkeys(("odometry", "answers", "stops"), 0)
-        for name in self.counts:
-            self.hear_topic(getattr(said, name), partial(self.heard, name))
-
-    def heard(self, name, message, header) -> None:
-        """Count."""
-        if name == "answers" and not message.done:  # it is not there yet
-            assert message.why == "no server answers"
-            return
-        self.counts[name] += 1
-        if name == "odometry":
-            assert message.linear_mps == 0.5
-            assert -0.5 < self.clock.now() - header.stamp < 0.5
-        if name == "answers":
-            assert message.message == "by the other implementation"
-
-    @every(0.5)
-    def write(self) -> None:
-        """Write."""
-        if all(self.counts.values()) and self.counts["odometry"] >= 20:
-            complain("passed on: 20")

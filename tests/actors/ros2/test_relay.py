@@ -22,7 +22,7 @@ from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_against_ros import PYTHON, ROS
 from tests.actors.ros2.test_gateway import SYSTEM
-from tests.actors.ros2.test_live import MORE, Peer
+from tests.actors.ros2.test_live import SERVICES, Peer, check_passing, echoed
 from tests.actors.ros2.test_reports import REPORTS
 from tests.cli.look.test_ros_verbs import checked
 from tests.real_tools import printed
@@ -57,10 +57,8 @@ kind = "control"
 parameters = {{ middleware = "rclpy", setup = "{setup}", domain = {domain}, \
 distribution = "kilted", interfaces = ["interfaces"] }}
 ''').replace('frame = "odom"\n', 'frame = "odom"\nreliable = false\n')
-        text += MORE[MORE.index("[[node]]\nname = \"screen\""):].replace("{{", "{").replace(
-            "}}", "}")
         path = tmp_path / "guarded.toml"
-        path.write_text(text + more)
+        path.write_text(text + SERVICES + more)
         where = tmp_path / "interfaces/test_msgs/action"
         where.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROS / "share/test_msgs/action/Fibonacci.action", where)
@@ -72,11 +70,6 @@ distribution = "kilted", interfaces = ["interfaces"] }}
 def relay_of(run):
     relay, = psutil.Process(run.pid("gateway")).children()
     return relay
-
-
-def echoed(run, key, count=1):
-    lines = printed(run, "topic", "echo", key, "-n", str(count), "--json", "--duration", "15")
-    return [json.loads(line)["message"] for line in lines.splitlines()]
 
 
 COUNT = """
@@ -121,12 +114,7 @@ def test_topics_services_and_actions_over_dds(tmp_path, system):
     with Peer(PEER, "base") as peer:
         peer.wait_for("up")
         with RealRun(tmp_path, path) as run:
-            run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
-            assert set(peer.said("heard")) <= {0.5}
-            run.wait_until(lambda: True in peer.said("shut"), 10, "no request")
-            peer.ask("stop")
-            run.wait_until(lambda: "told" in peer.said("answer"), 10, "no answer")
-            run.wait_for("passed on: 20", 10)
+            check_passing(run, peer)
             run.wait_until(lambda: 3 in peer.said("goal"), 10, "no goal")
             assert "succeeded" in {one["phase"] for one in echoed(run, "count/state", 6)}
             told = json.loads(run.tool("status", "--json").stdout)["ros2"]
@@ -168,12 +156,14 @@ def test_what_is_killed_comes_back_alone_and_a_rival_and_a_missing_node_are_repo
             return echoed(run, "detection/D_NODES")[0]["state"] == "idle"
 
         run.wait_until(idle, 10, "the node is missing still")
-        with Peer(PEER, "rival"):
+        with Peer(PEER, "rival") as rival:
             run.wait_until(lambda: "two publishers, /base and /rival" in printed(
                 run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"),
                 10, "not refused")
             assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
             run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
+            rival.process.terminate()  # else it stays in the graph for 20 s
+            rival.process.wait()
         run.wait_until(idle, 30, "the rival is there still")
         program.terminate()
         run.wait_for("(D_NODES): /base: not in the graph of ROS 2", 10)
