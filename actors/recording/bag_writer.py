@@ -29,7 +29,7 @@ from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import Forms, Recorded
 from rampart.actors.recording.run_documents import Documents
 from rampart.actors.recording.views import View, Views, encode
-from rampart.actors.system.topics import find_topic
+from rampart.actors.system.topics import find_topic, own_topics
 
 PROFILE = "rampart"
 RUN = "rampart.run"
@@ -179,7 +179,9 @@ class BagWriter:
         self._file = file
         self._zero_s = time_zero_s
         self._forms = Forms(documents.known.topics)
-        self._own = documents.own
+        self._own: tuple[Topic[Any], ...] = ()
+        with contextlib.suppress(ValueError):  # an actor whose module is missing
+            self._own = own_topics(documents.known.system)
         self._views = views
         self._wants = wants
         self._schemas: dict[Any, int] = {}
@@ -188,8 +190,8 @@ class BagWriter:
         from mcap.writer import CompressionType, Writer  # noqa: PLC0415 few runs are recorded
 
         self._writer = Writer(file, compression=CompressionType.LZ4)
-        self._writer.start(PROFILE, f"rampart {documents.version}")
-        self._writer.add_metadata(RUN, {**documents.metadata(), "time_zero_s": f"{time_zero_s:g}"})
+        self._writer.start(PROFILE, f"rampart {documents.run['rampart_version']}")
+        self._writer.add_metadata(RUN, {**documents.run, "time_zero_s": f"{time_zero_s:g}"})
         for name, media_type, data in documents.files:
             self._writer.add_attachment(0, 0, name, media_type, data)
         if views is not None:

@@ -74,7 +74,7 @@ class BlackBoxWriter:
                  again: bool = False, wall: Callable[[], float] = time.time) -> None:
         self._system, self._folder = folder, folder / documents.run_id
         self._limits, self._wall = limits, wall
-        self._origin_s, self._rate = origin_s, documents.rate
+        self._origin_s, self._rate = origin_s, float(documents.run["rate"])
         self._run = documents.run_id
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         incidents.settle(folder, _living() | {self._run} if again else _living() - {self._run})
@@ -82,7 +82,7 @@ class BlackBoxWriter:
         self._lock = _locked(self._folder)
         incidents.begin(self._folder, documents)
         self._most_bytes = int(limits.limit_mb * 1e6)
-        self._ring = Ring(self._folder, self._most_bytes // _SEGMENTS, origin_s, documents.rate)
+        self._ring = Ring(self._folder, self._most_bytes // _SEGMENTS, origin_s, self._rate)
         self._make_room(is_whole=True)
         known = [one for one, _ in incidents.incidents_in(folder) if one.run == self._run]
         self._last = known[-1] if known and again else None

@@ -23,23 +23,19 @@ import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.recording import ring
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.ring import Ring, Span
 from rampart.actors.recording.run_documents import (
-    NOT_CHOSEN,
     Documents,
     recorded_system,
     restore,
 )
 from rampart.actors.recording.views import Views
-from rampart.actors.system.topics import own_topics
 from rampart.files.writing import replace_file, sync
 from rampart.manager.spec.tables import BlackBox
 
@@ -310,21 +306,7 @@ def _documents(folder: Path) -> tuple[Documents, Views]:
     """
     head = Summary(BagReader(folder / HEAD))
     _, known = recorded_system(head.files)
-    own: tuple[Topic[Any], ...] = ()
     with contextlib.suppress(ValueError), tempfile.TemporaryDirectory() as restored:
         restore(head.files, Path(restored))
         known = msgspec.structs.replace(known, application=known.kind.restored(Path(restored)))
-    with contextlib.suppress(ValueError):  # an actor whose module is missing
-        own = own_topics(known.system)
-    run = head.run
-    try:
-        nodes = msgspec.json.decode(run.get("nodes", "[]"), type=tuple[str, ...])
-        rate = float(run.get("rate", "1"))
-    except ValueError as error:
-        raise BagError(f"{folder / HEAD}: {error}") from None
-    plan = {name: value for name, value in run.items() if name not in NOT_CHOSEN}
-    plain = msgspec.structs.replace(known, application=None)  # its options are in the plan
-    return Documents(
-        run_id=run.get("run_id", ""), title=run.get("title", ""), rate=rate, nodes=nodes, plan=plan,
-        started=run.get("started", ""), files=tuple(head.files),
-        version=run.get("rampart_version", ""), known=plain, own=own), known.views()
+    return Documents({"rampart_version": "", **head.run}, tuple(head.files), known), known.views()

@@ -18,7 +18,6 @@ from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.members import application_class, import_class, load_application
-from rampart.actors.system.topics import own_topics
 from rampart.files import working_folder
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.spec.specification import SystemSpec, check_document, read_document
@@ -61,38 +60,19 @@ class Documents(msgspec.Struct, frozen=True):
     """Description of a run in its recording.
 
     Attributes:
-        run_id: unique name of the run.
-        title: title for people.
-        rate: simulated seconds per real second.
-        nodes: names of the nodes.
-        plan: plan of the run (`RunPlan.description`), as plain data.
-        started: wall time at which the recording began, ISO 8601; empty in virtual time.
+        run: metadata record; of an option with a path it has the name of the file only.
         files: the system, and files that the application names.
-        version: version of this program.
         known: system and application.
-        own: topics that the system's actors declare.
     """
 
-    run_id: str
-    title: str
-    rate: float
-    nodes: tuple[str, ...]
-    plan: Mapping[str, Any]
-    started: str
+    run: dict[str, str]
     files: tuple[File, ...] = ()
-    version: str = ""
     known: RunContents = RunContents()
-    own: tuple[Topic[Any], ...] = ()
 
-    def metadata(self) -> dict[str, str]:
-        """Return the metadata record; an option with a path has the name of the file only."""
-        chosen = self.known.application.options if self.known.application else None
-        options = {**self.plan, **(msgspec.structs.asdict(chosen) if chosen else {})}
-        names = {name: PurePosixPath(str(value)).name or str(value)
-                 for name, value in options.items() if name != "system_file"}
-        return {**names, "format": FORMAT, "run_id": self.run_id, "title": self.title,
-                "rate": f"{self.rate:g}", "started": self.started,
-                "rampart_version": self.version, "nodes": json.dumps(self.nodes)}
+    @property
+    def run_id(self) -> str:
+        """Unique name of the run."""
+        return self.run["run_id"]
 
 
 NOT_CHOSEN = ("format", "run_id", "title", "rate", "started", "rampart_version", "nodes",
@@ -100,19 +80,21 @@ NOT_CHOSEN = ("format", "run_id", "title", "rate", "started", "rampart_version",
 """Fields of the metadata record that are not options of the plan."""
 
 
-def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
+def collect(plan: Mapping[str, Any], *, run_id: str, title: str, rate: float,
+            nodes: Sequence[str], started: str) -> Documents:
     """Return the documents of a run with its files; files that cannot be read are left out.
 
     Args:
-        plan: plan of the run, as plain data.
-        described: other attributes of `Documents`.
+        plan: plan of the run (`RunPlan.description`), as plain data.
+        run_id: unique name of the run.
+        title: title for people.
+        rate: simulated seconds per real second.
+        nodes: names of the nodes.
+        started: wall time at which the recording began, ISO 8601; empty in virtual time.
     """
     system_file = Path(str(plan.get("system_file", "")))
     working_folder.admit(system_file.parent)
     known = known_of(plan)
-    own: tuple[Topic[Any], ...] = ()
-    with contextlib.suppress(ValueError):  # an actor whose module is missing
-        own = own_topics(known.system)
     paths = [(SYSTEM, system_file)]
     with contextlib.suppress(OSError):  # a folder that cannot be listed
         paths += known.application.documents() if known.application else []
@@ -127,8 +109,13 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
         own_version = version("rampart-robot")
     except PackageNotFoundError:
         own_version = "unknown"
-    return Documents(plan=plan, files=tuple(files), version=own_version, known=known, own=own,
-                     **described)
+    chosen = msgspec.structs.asdict(known.application.options) if known.application else {}
+    options = {name: PurePosixPath(str(value)).name or str(value)
+               for name, value in {**plan, **chosen}.items() if name != "system_file"}
+    return Documents({
+        **options, "format": FORMAT, "run_id": run_id, "title": title, "rate": f"{rate:g}",
+        "started": started, "rampart_version": own_version, "nodes": json.dumps(nodes),
+    }, tuple(files), known)
 
 
 def known_of(plan: Mapping[str, Any]) -> RunContents:

@@ -21,7 +21,7 @@ from rampart.actors.recording.recorder import EachOnce, Recorder, distinct, keys
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.testing import wait_until
-from tests.actors.recording.samples import AnsweringLauncher, documents, running
+from tests.actors.recording.samples import PLAN, AnsweringLauncher, running
 from tests.two_hosts import two_hosts
 
 BEAT = Heartbeat(1, 2, 0.1, 0, 0)
@@ -62,7 +62,7 @@ def test_each_host_hears_what_nodes_guards_and_people_of_the_other_may_say_once(
 
 
 def test_a_system_of_one_host_has_nothing_to_hear_and_too_many_keys_are_heard_as_one():
-    plan = RunPlan(system_file=documents().plan["system_file"])
+    plan = RunPlan(system_file=PLAN["system_file"])
     assert keys_elsewhere(Layout(plan, load_system(plan))) == ()
     assert distinct({"a/*", "a/b", "a/c/d", "x"}) == ("a/*", "a/c/d", "x")
     assert distinct({f"rampart/heartbeat/node_{n}" for n in range(5000)}) == ("rampart/**",)
