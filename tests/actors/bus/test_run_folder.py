@@ -48,32 +48,27 @@ def test_a_place_too_deep_for_a_socket_is_not_chosen(tmp_path, monkeypatch):
     deep.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
     folder = run_folder.make(1, os.getpid())
-    try:
-        assert not folder.startswith(str(tmp_path))
-        with socket.socket(socket.AF_UNIX) as listener:
-            listener.bind(f"{folder}/{run_folder.ROUTERS[0]}")
-    finally:
-        run_folder.remove(folder)
+    assert not folder.startswith(str(tmp_path))
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(f"{folder}/{run_folder.ROUTERS[0]}")
+    run_folder.remove(folder)
 
 
-def test_the_last_issued_incarnation_is_found_with_its_process():
-    folder = run_folder.make(1, os.getpid())
-    try:
-        register = run_folder.register_of(folder)
-        for name in ("DM1", "", "..", "../issued/DM1", "a/b", "x\0", "\ud800", "n" * 5000):
-            assert register(name) is None
-        Path(folder, "issued", "DM1~").symlink_to("7")  # its writer died here
-        assert run_folder.issued(folder) == {}
-        run_folder.issue(folder, ("DM1", "RM1"), 1)
-        run_folder.issue(folder, ("DM1",), 12, os.getpid())
-        assert (register("DM1"), register("RM1")) == (12, 1)
-        assert run_folder.issued(folder) == {"DM1": 12, "RM1": 1}
-        assert run_folder.is_here(folder, "DM1")
-        assert not run_folder.is_here(folder, "DM2")
-        run_folder.issue(folder, ["DM1"], 13)  # of another machine
-        assert not run_folder.is_here(folder, "DM1")
-    finally:
-        run_folder.remove(folder)
+def test_the_last_issued_incarnation_is_found_with_its_process(sockets):
+    folder, register = sockets, run_folder.register_of(sockets)
+    for name in ("DM1", "", "..", "../issued/DM1", "a/b", "x\0", "\ud800", "n" * 5000):
+        assert register(name) is None
+    Path(folder, "issued", "DM1~").symlink_to("7")  # its writer died here
+    assert run_folder.issued(folder) == {}
+    run_folder.issue(folder, ("DM1", "RM1"), 1)
+    run_folder.issue(folder, ("DM1",), 12, os.getpid())
+    assert (register("DM1"), register("RM1")) == (12, 1)
+    assert run_folder.issued(folder) == {"DM1": 12, "RM1": 1}
+    assert run_folder.is_here(folder, "DM1")
+    assert not run_folder.is_here(folder, "DM2")
+    run_folder.issue(folder, ["DM1"], 13)  # of another machine
+    assert not run_folder.is_here(folder, "DM1")
+    run_folder.remove(folder)
     assert register("DM1") is None
     assert run_folder.issued(folder) == {}
     with pytest.raises(OSError, match="No such file"):

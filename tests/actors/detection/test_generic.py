@@ -378,43 +378,32 @@ def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, wor
 
 
 @pytest.mark.parametrize("here", [True, False])
-def test_a_node_of_this_machine_that_takes_too_much_is_named(here):
-    used = {"busy": 0.0, "memory": 1_000_000}
+@within(VirtualSystem)
+async def test_a_node_of_this_machine_that_takes_too_much_is_named(system, here):
+    used = {"busy": 0.0, "memory": 1e6}
+    ear = system.start("ear", Ear)
+    system.start("D", lambda context: ProcessUsage(replace(
+        context, is_here=lambda _node: here, usage=lambda pid: ProcessCount(
+            used["busy"], int(used["memory"]), 0.0) if pid == 77 else None)),
+        watch=["a"], processor_share=0.5, memory_mb=50, for_s=1.0, clear_s=1.0)
 
-    async def scenario() -> None:
-        async with VirtualSystem() as system:
-            ear = system.start("ear", Ear)
-            module = ProcessUsage(replace(
-                system.context("D", {"watch": ["a"], "processor_share": 0.5, "memory_mb": 50,
-                                     "for_s": 1.0, "clear_s": 1.0}),
-                usage=lambda pid: ProcessCount(used["busy"], int(used["memory"]), 0.0)
-                if pid == 77 else None,
-                is_here=lambda _node: here))
-            task = asyncio.create_task(module.run())
+    async def after(busy_s: float, memory: float = 1e6) -> str:
+        used["memory"] = memory
+        for _ in range(20):
+            system.say(bus_topics.HEARTBEAT, bm.Heartbeat(77, 1, 0.1, 0, 0), "a", incarnation=3)
+            used["busy"] += busy_s
+            await asyncio.sleep(0.1)
+        return ear.heard[-1][1].reason
 
-            async def after(busy_s: float, memory: float = 1e6) -> tuple[list[str], str]:
-                used["memory"] = memory
-                for _ in range(20):
-                    system.say(bus_topics.HEARTBEAT, bm.Heartbeat(77, 1, 0.1, 0, 0), "a",
-                               incarnation=3)
-                    used["busy"] += busy_s
-                    await asyncio.sleep(0.1)
-                return ear.states, ear.heard[-1][1].reason
-
-            assert await after(0.02) == (["idle"], "")
-            states, why = await after(0.08)
-            if here:
-                assert states == ["idle", "active"]
-                assert "of a core, more than 0.5" in why
-                assert ear.heard[-1][1].nodes == ("a#3",)
-                assert await after(0.0) == (["idle", "active", "idle"], "")
-                assert (await after(0.0, 60e6))[1] == "a: 60 MB of memory, more than 50 MB"
-            else:  # the number of a process of another machine proves nothing
-                assert states == ["idle"]
-            module.stop()
-            await task
-
-    run(scenario)
+    assert await after(0.02) == ""
+    why = await after(0.08)
+    if here:
+        assert "of a core, more than 0.5" in why
+        assert ear.heard[-1][1].nodes == ("a#3",)
+        assert await after(0.0) == ""
+        assert await after(0.0, 60e6) == "a: 60 MB of memory, more than 50 MB"
+    else:  # the number of a process of another machine proves nothing
+        assert ear.states == ["idle"]
 
 
 # -- a host that cannot be reached: when it is reported, which host, and when it is o

@@ -16,9 +16,8 @@ from rampart.testing import Ear, VirtualSystem, run
 NODES = ("a", "b", "c", "d", "e", "f")
 
 
-def states(script: list[tuple[float, str, float]], *, under_way_s: float = 0.0,
-           until_s: float = 6.0, waits_until_s: float = 0.0, incarnation: int = 1
-           ) -> list[tuple[float, str]]:
+def states(script: list[tuple[float, str, float]], *, until_s: float = 6.0,
+           waits_until_s: float = 0.0, incarnation: int = 1) -> list[tuple[float, str]]:
     """When DM14 changed its state: heartbeats at a time, from nodes, that were so late.
 
     Until `waits_until_s` their processes wait for a processor for a fifth of the time.
@@ -28,24 +27,19 @@ def states(script: list[tuple[float, str, float]], *, under_way_s: float = 0.0,
         async with VirtualSystem() as system:
             ear = system.start("ear", Ear)
             system.incarnations["D"] = incarnation - 1
-            context = replace(
-                system.context("D", {"watch": list(NODES), "late_s": 0.15, "clear_s": 1.0,
-                                     "wait_s": 4.0}),
-                incarnation=incarnation, scheduled=lambda _pid: Usage(
-                    "S", 1.0, 0.2 * min(system.clock.now(), waits_until_s)))
-            task = asyncio.create_task(Overload(context).run())
+            system.start("D", lambda context: Overload(replace(context, scheduled=lambda _: Usage(
+                "S", 1.0, 0.2 * min(system.clock.now(), waits_until_s)))),
+                watch=list(NODES), late_s=0.15, clear_s=1.0, wait_s=4.0)
             for at_s, nodes, late_s in script:
                 await asyncio.sleep(max(0.0, at_s - system.clock.now()))
                 for node in nodes:
                     beat = bm.Heartbeat(ord(node), 1, 0.1, 0, 0, late_s)
-                    system.say(bus_topics.HEARTBEAT, beat, node,
-                               stamp_s=system.clock.now() - under_way_s)
+                    system.say(bus_topics.HEARTBEAT, beat, node)
             await asyncio.sleep(until_s - system.clock.now())
             found: list[tuple[float, str]] = []
             for at_s, report in ear.heard:
                 if not found or found[-1][1] != report.state.value:
                     found.append((round(at_s, 1), report.state.value))
-            task.cancel()
             return found
 
     return run(scenario)
