@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.disagreement import Disagreement, Vote, apart
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.link_lost import LinkLost
+from rampart.actors.detection.overload import Overload
 from rampart.actors.detection.process_usage import ProcessUsage
 from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
@@ -21,7 +23,9 @@ from rampart.actors.detection.threshold import Threshold
 from rampart.actors.detection.unchanged import Unchanged, UnchangedMonitor
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
+from rampart.actors.machine.patience import Usage
 from rampart.actors.machine.process_usage import ProcessCount
+from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.testing import Ear, VirtualSystem, play, run, table
 from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
@@ -198,18 +202,21 @@ def test_how_far_apart(one, other, angle, distance):
 # -- on the bus --------------------------------------------------------------------------------
 
 
-def reports(kind: type, script: list[tuple[float, Any, Any]], until_s: float,
+def reports(kind: Callable[[Context], Actor], script: list[tuple[Any, ...]], until_s: float,
             respawned: bool = False, **parameters: Any) -> list[tuple[float, str, str]]:
-    """Return time, state and reason of the reports, for a script of (time, topic, message)."""
+    """Return when a module changed its state, that, and why.
+
+    The script is what is said: time, topic, message and, if it is not the gauge, by whom.
+    """
 
     async def scenario() -> list[tuple[float, str, str]]:
         async with VirtualSystem(topics=TOPICS) as system:
             ear = system.start("ear", Ear)
             system.incarnations["D"] = 1 if respawned else 0
             system.start("D", kind, **parameters)
-            for at_s, topic, message in script:
+            for at_s, topic, message, *source in script:
                 await asyncio.sleep(max(0.0, at_s - system.clock.now()))
-                system.say(topic, message, "gauge")
+                system.say(topic, message, *(source or ["gauge"]))
             await asyncio.sleep(until_s - system.clock.now())
             found: list[tuple[float, str, str]] = []
             for at_s, report in ear.heard:
@@ -406,34 +413,80 @@ async def test_a_node_of_this_machine_that_takes_too_much_is_named(system, here)
         assert ear.states == ["idle"]
 
 
-# -- a host that cannot be reached: when it is reported, which host, and when it is o
+# -- a host that cannot be reached -------------------------------------------------------------
 
 
-def table(*lost: str) -> fm.NodeTable:
+def lost(*hosts: str) -> fm.NodeTable:
     return fm.NodeTable(tuple(
-        fm.NodeInfo(f"router_a_{host}", "supervision", 1, fm.NodeState.UNREACHABLE if host in lost
+        fm.NodeInfo(f"router_a_{host}", "supervision", 1, fm.NodeState.UNREACHABLE if host in hosts
                     else fm.NodeState.RUNNING, 1, 0, host=host) for host in ("ground", "moon")))
 
 
-@pytest.mark.parametrize(("parameters", "lost", "reason"), [
-    ({}, ("ground",), "no link to ground"),
+@pytest.mark.parametrize(("parameters", "hosts", "reason"), [
     ({}, ("ground", "moon"), "no link to ground, moon"),
     ({"host": "moon"}, ("ground",), ""),
     ({"host": "moon"}, ("ground", "moon"), "no link to moon"),
     ({"for_s": 1.0}, ("ground",), ""),
     ({"for_s": 0.3}, ("ground",), "no link to ground"),
 ])
-@within(VirtualSystem)
-async def test_who_is_lost_is_told_after_the_time_that_was_said(system, parameters, lost, reason):
-    system.start("D_LINK", LinkLost, **parameters)
-    ear = system.start("ear", Ear)
-    for said in (table(), table(*lost), table(*lost)):
-        system.say(topics.NODES, said, "supervisor")
-        await asyncio.sleep(0.4)
-    assert ear.heard[-1][1].reason == reason
-    assert ear.states == (["idle", "active"] if reason else ["idle"])
-    system.say(topics.NODES, table(), "supervisor")
-    await asyncio.sleep(0.4)
-    system.say(topics.NODES, table(), "supervisor")
-    await asyncio.sleep(0.1)
-    assert ear.states[-1] == "idle"
+def test_who_is_lost_is_told_after_the_time_that_was_said(parameters, hosts, reason):
+    tables = (lost(), lost(*hosts), lost(*hosts), lost(), lost())
+    script = [(0.4 * i, topics.NODES, one, "supervisor") for i, one in enumerate(tables)]
+    found = reports(LinkLost, script, 1.7, **parameters)
+    assert [(state, why) for _, state, why in found] == [
+        ("idle", ""), ("active", reason), ("idle", "")][:3 if reason else 1]
+
+
+# -- many nodes that are late at once: what they have in common is the machine -----------------
+
+
+NODES = ("a", "b", "c", "d", "e", "f")
+
+
+def overloaded(script: list[tuple[float, Collection[str], float]], until_s: float = 6.0,
+               waits_until_s: float = 0.0, **options: bool) -> list[tuple[float, str]]:
+    """When DM14 changed its state: heartbeats at a time, from nodes, that were so late.
+
+    Until `waits_until_s` their processes wait for a processor for a fifth of the time.
+    """
+    def module(context: Context) -> Overload:
+        return Overload(replace(context, scheduled=lambda _pid: Usage(
+            "S", 1.0, 0.2 * min(context.clock.now(), waits_until_s))))
+
+    beats = [(at_s, bus_topics.HEARTBEAT, bm.Heartbeat(ord(node), 1, 0.1, 0, 0, late_s), node)
+             for at_s, nodes, late_s in script for node in nodes]
+    found = reports(module, beats, until_s, **options, watch=list(NODES), late_s=0.15, clear_s=1.0,
+                    wait_s=4.0)
+    return [(round(at_s, 1), state) for at_s, state, _ in found]
+
+
+def test_many_that_are_late_at_once_are_an_overload_until_they_have_not_been_for_a_while():
+    script = [(1.0 + 0.2 * i, "abc", 0.2) for i in range(5)]
+    assert overloaded(script)[1:] == [(1.0, "active"), (3.3, "idle")]
+
+
+@pytest.mark.parametrize("script", [
+    [(1.0 + 0.1 * i, "a", 3.0) for i in range(20)],  # one is a fault of its own
+    [(1.0, "a", 0.2), (2.0, "b", 0.2), (3.0, "c", 0.2)],  # not at once
+    [(1.0 + 0.1 * i, NODES, 0.05) for i in range(20)],  # not late enough
+])
+def test_few_or_a_little_late_are_no_overload(script):
+    assert {state for _, state in overloaded(script)} == {"idle"}
+
+
+def test_one_that_was_late_for_long_counts_for_as_long():
+    """A loop that turns every 0.9 s reports every 0.9 s; another one reports in between."""
+    script = [(1.0 + 0.45 * i, "ab"[i % 2], 0.9) for i in range(8)]
+    assert [state for _, state in overloaded(script, 4.0)] == ["idle", "active"]
+
+
+@pytest.mark.parametrize(("waits_until_s", "idle_s"), [(0.0, 2.5), (3.2, 4.7), (99.0, 6.5)])
+def test_it_lasts_while_many_wait_for_a_processor_but_not_for_ever(waits_until_s, idle_s):
+    found = overloaded([(1.0, "abc", 0.2)], 9.0, waits_until_s)
+    assert found[1:] == [(1.0, "active"), (pytest.approx(idle_s, abs=0.4), "idle")]
+
+
+def test_a_successor_says_nothing_before_it_knows():
+    assert overloaded([], 0.4, respawned=True) == []
+    assert overloaded([], 2.0, respawned=True) == [(0.5, "idle")]
+    assert overloaded([(0.3, "abc", 0.2)], 0.9, respawned=True) == [(0.3, "active")]
