@@ -103,17 +103,6 @@ async def test_a_recovery_module_s_brake_is_its_own_to_release_whatever_anybody_
     assert not world.is_braked
 
 
-@within(partial(living, "simulator"))
-async def test_who_forges_an_incarnation_of_the_safety_pilot_neither_drives_nor_mutes_it(world):
-    await world.tell(topics.BASE_COMMAND, m.BaseCommand(3.0, 0.0), "safety_pilot", FORGED)
-    assert world.actor._world._drive._wanted == (0.0, 0.0)
-    await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.5, 0.0), "safety_pilot")
-    assert world.actor._world._drive._wanted == (0.5, 0.0)
-    for _ in range(2):
-        await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.0, 0.0), "safety_pilot")
-    assert world.actor._world._drive._wanted == (0.0, 0.0)
-
-
 # -- the Safety Pilot ---------------------------------------------------------------------------
 
 
