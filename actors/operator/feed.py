@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
@@ -32,8 +31,6 @@ LOOK_S = 1.0
 
 SEND_TIMEOUT_S = 5.0
 IN_FLIGHT = 2
-
-_SEEN = re.compile(rb'\{"type":"seen","version":(\d{1,33})\}')
 
 
 class PageFeed:
@@ -120,13 +117,6 @@ class Feed:
                 page.sends(self._state.picture.version)
                 await send(text)
             await page.news.wait()
-
-    def take(self, page: PageFeed, text: str | bytes | None) -> bool:
-        """Return whether a message of a page reports a drawn frame, and note the report."""
-        raw = text.encode(errors="replace") if isinstance(text, str) else text or b""
-        if found := _SEEN.fullmatch(raw):
-            page.seen(int(found[1]))
-        return found is not None
 
     def frame(self, since: int) -> str:
         """Return the changes since a version, encoded once for all pages."""

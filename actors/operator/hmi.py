@@ -297,8 +297,8 @@ class Hmi(Actor):
             access, Feed(self._state, self.clock.now, self._hello, self._look),
             Handlers(self.requests, operating.introduction, self._fulfil, operating.left,
                      self.refuses, self._role),
-            lambda port: Gate(register, secret, port, owner=owner,
-                              tls=tls is not None or page.behind.startswith("https:")), audit,
+            Gate(register, secret, self._port, owner=owner,
+                 tls=tls is not None or page.behind.startswith("https:")), audit,
             tls=tls, files=self.files, complain=complain)
 
     def _complain(self, why: str) -> None:

@@ -82,6 +82,12 @@ class StickRequest(Request, frozen=True, tag="stick"):
     pressed_s: float = 0.0
 
 
+class SeenRequest(Request, frozen=True, tag="seen"):
+    """Report that the page has drawn a version of the picture; it gets no answer."""
+
+    version: int
+
+
 REQUESTS: tuple[type[Request], ...] = (
     ResetRequest, StrategyRequest, SignalRequest, InjectRequest, EndFaultRequest, StickRequest)
 """Requests of every page."""
@@ -95,12 +101,12 @@ class RequestReader:
     """Decodes the messages of a page.
 
     Args:
-        kinds: types of requests.
+        kinds: types of requests; `SeenRequest` is always one.
     """
 
     def __init__(self, kinds: Sequence[type[Request]]) -> None:
         self._decoder: msgspec.json.Decoder[Request] = msgspec.json.Decoder(
-            Union[tuple(kinds)])  # noqa: UP007 known at run time
+            Union[(*kinds, SeenRequest)])
 
     def read(self, text: str | bytes | None) -> Request:
         """Return the request in a message.

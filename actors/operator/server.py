@@ -27,6 +27,7 @@ from rampart.actors.operator.requests import (
     RefusedError,
     Request,
     RequestReader,
+    SeenRequest,
     StickRequest,
 )
 from rampart.actors.web.access import SUBPROTOCOL, Access
@@ -118,10 +119,10 @@ class PageServer:
     """Serves the operator's page on the running loop until `stop`.
 
     Args:
-        access: address and rules; port 0 lets the system choose one.
+        access: address and rules.
         feed: contents of the page.
         handlers: callbacks for pages.
-        gate: returns the gate of a page on a port.
+        gate: knows the visitors.
         audit: of the page.
         tls: certificate, or None.
         files: folder with the robot's JavaScript and CSS, or None.
@@ -132,7 +133,7 @@ class PageServer:
     """
 
     def __init__(self, access: Access, feed: Feed, handlers: Handlers,
-                 gate: Callable[[int], Gate], audit: AuditLog, *, tls: Tls | None = None,
+                 gate: Gate, audit: AuditLog, *, tls: Tls | None = None,
                  files: Path | None = None, complain: Callable[[str], None] = to_stderr) -> None:
         self._feed = feed
         self._complain = complain
@@ -141,10 +142,8 @@ class PageServer:
         self._reader = RequestReader(handlers.requests)
         self._count = 0
         self._open: dict[int, _Page] = {}
-        listening = listen(access.host, access.port)
-        self.port: int = listening.getsockname()[1]
-        access = msgspec.structs.replace(access, port=self.port)
-        self._gate = gate(self.port)
+        self.port = access.port
+        self._gate = gate
         public = page_files(files)
 
         async def file(request: HttpRequest) -> Response:
@@ -158,7 +157,7 @@ class PageServer:
             Starlette(routes=routes, middleware=[Middleware(
                 Door, access=access, gate=self._gate, public=frozenset(public),
                 refusal="" if asks else _REFUSAL)]),
-            listening, tls=tls.serving() if tls else None, complain=complain,
+            listen(access.host, access.port), tls=tls.serving() if tls else None, complain=complain,
             proxy_headers=bool(access.behind), ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
 
@@ -231,8 +230,9 @@ class PageServer:
     async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
         while (message := await socket_.receive())["type"] != "websocket.disconnect":
             text = message.get("text") or message.get("bytes")
-            if not self._feed.take(fed, text):
-                await _send(socket_, self._answer(text, page))
+            answer = self._answer(text, page, fed)
+            if answer is not None:
+                await _send(socket_, answer)
 
     async def _watch(self, socket_: WebSocket, page: _Page) -> None:
         """Close the page when its visitor is not valid any more."""
@@ -247,10 +247,14 @@ class PageServer:
             except TimeoutError:
                 await _close(socket_, 1013, "this page does not keep up")
 
-    def _answer(self, text: str | bytes | None, page: _Page) -> dict[str, Any]:
+    def _answer(self, text: str | bytes | None, page: _Page, fed: PageFeed
+                ) -> dict[str, Any] | None:
         request: Request | None = None
         try:
             request = self._reader.read(text)
+            if isinstance(request, SeenRequest):
+                fed.seen(request.version)
+                return None
             if not self._gate.still(page.visitor):
                 raise RefusedError(_REVOKED)
             if why := self._bars(self._handlers.role(request), page.visitor):

@@ -154,14 +154,14 @@ async def test_a_page_is_greeted_then_gets_everything_then_changes():
 async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest():
     async with Pushing() as p:
         await p.line.until(lambda frames: len(frames) >= 2)
-        assert p.feed.take(p.page, b'{"type":"seen","version":0}')
+        p.page.seen(0)
         for i in range(30):
             p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
             await asyncio.sleep(hmi_feed.FRAME_GAP_S / 4)
         on_the_way = len(p.line.frames) - 1
         assert on_the_way <= hmi_feed.IN_FLIGHT + 1
         version = p.line.frames[-1]["version"]
-        p.feed.take(p.page, f'{{"type":"seen","version":{version}}}')
+        p.page.seen(version)
         await p.line.until(lambda frames: frames[-1].get("pilot", {}).get(
             "value", {}).get("reason") == "29")
         assert len(p.line.frames) - 1 == on_the_way + 1
@@ -171,18 +171,9 @@ async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.3)
     async with Pushing() as p:
         await p.line.until(lambda frames: len(frames) >= 2)
-        p.feed.take(p.page, b'{"type":"seen","version":0}')
+        p.page.seen(0)
         for i in range(hmi_feed.IN_FLIGHT + 1):
             p.state.log(1.0, "note", str(i))
             await asyncio.sleep(2 * hmi_feed.FRAME_GAP_S)
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(asyncio.shield(p.task), 5)
-
-
-@pytest.mark.parametrize("text", [
-    b"", b'{"type":"seen","version":-1}', b'{"type":"seen","version":' + 60 * b"1" + b"}", "\ud800",
-    None, '{"type": "reset", "recovery": "RM1"}',
-])
-def test_what_is_no_answer_is_left_to_others(text):
-    feed = Feed(OsmosisState(), lambda: 0.0, dict)
-    assert feed.take(hmi_feed.PageFeed(), text) is False
