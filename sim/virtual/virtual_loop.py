@@ -45,28 +45,6 @@ class _Call:
         return self._when
 
 
-class _Files(selectors.DefaultSelector):
-    """Files that the loop watches.
-
-    Attributes:
-        count: Number of files; read after each timer, for which the selector's map is too slow.
-    """
-
-    count = 0
-
-    def register(self, *args: Any, **more: Any) -> selectors.SelectorKey:
-        """Watch a file."""
-        key = super().register(*args, **more)
-        self.count = len(self.get_map())
-        return key
-
-    def unregister(self, *args: Any) -> selectors.SelectorKey:
-        """Watch it no more."""
-        key = super().unregister(*args)
-        self.count = len(self.get_map())
-        return key
-
-
 class VirtualLoop(asyncio.SelectorEventLoop):
     """A loop whose time stands still during callbacks and jumps where it would wait.
 
@@ -77,8 +55,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        self._files = _Files()
+        self._files = selectors.DefaultSelector()
         super().__init__(self._files)
+        self._watched = self._files.get_map()
         self.now_s = 0.0
         self._count = 0
         # When, count, a posted callback and its arguments; or instead of these None, a `_Call`.
@@ -133,7 +112,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _run_once(self) -> None:
         # asyncio's own step, called by `run_forever`, with the waiting left out.
         ready, files = self._ready, self._files  # type: ignore[attr-defined]
-        if files.count > 1:  # one is the loop's own wake-up pipe
+        if len(self._watched) > 1:  # one is the loop's own wake-up pipe
             self._process_events(files.select(0))  # type: ignore[attr-defined]
         if ready:
             for _ in range(len(ready)):
@@ -166,7 +145,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 if not timers or timers[0][0] > now_s or timers[0][1] > last:
                     break
                 _, _, callback, first, second = heappop(timers)
-            if ready or self._stopping or files.count > 1:  # type: ignore[attr-defined]
+            if ready or self._stopping or len(self._watched) > 1:  # type: ignore[attr-defined]
                 return
 
     def _make(self, call: _Call) -> None:
