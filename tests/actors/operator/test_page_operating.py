@@ -18,8 +18,8 @@ from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.page import LIVE, show
-from tests.actors.operator.test_operating import RELEASED, Hand
-from tests.actors.operator.world import World, hear, open_page, repeated, served
+from tests.actors.operator.test_operating import RELEASED
+from tests.actors.operator.world import World, repeated
 from tests.osmosis_system import shipped_system
 
 pytestmark = pytest.mark.page
@@ -218,24 +218,6 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world, tab):
     await asyncio.sleep(0.15)
     await tab.value(f"document.hasFocus = () => false; {held} = true")
     await stops(world)  # meant for another window
-
-
-@pytest.mark.usefixtures("patient")
-async def test_the_second_operator_sees_who_drives(world, hmi, tab):
-    async with open_page(await served(hmi)) as other:
-        number = (await hear(other, "operating"))["page"]
-        await Hand(other).take()
-        await tab.until("document.querySelector('.stick-state').textContent"
-                        f" === 'page {number} drives'")
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "ArrowDown", down=True)
-        await tab.until(f"{WORDS}.includes('page {number} has the stick')")
-    await tab.until(f"{WORDS}.includes('let go first, then press again')")
-    await stops(world)
-    await key(tab, "ArrowDown", down=False)
-    await key(tab, "ArrowDown", down=True)
-    await drives(tab, world, forward=-0.5)
-    await key(tab, "ArrowDown", down=False)
 
 
 @pytest.mark.parametrize("hmi", [{"launcher_pid": 1}], indirect=True)

@@ -7,8 +7,10 @@ import pytest
 from rampart.actors.operator.panels import Panel
 from rampart.testing import eventually
 from tests.actors.operator.page import show
+from tests.actors.operator.test_operating import Hand as Driver
 from tests.actors.operator.test_page_operating import key
 from tests.actors.operator.test_stick_panel import AT_REST, DRIVE, driven, rests
+from tests.actors.operator.world import open_page
 from tests.tank import Hand
 
 pytestmark = [pytest.mark.page, pytest.mark.usefixtures("patient")]
@@ -29,7 +31,7 @@ async def is_told(robot, hand: Hand) -> None:
 
 
 async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_s(world, tab):
-    async with driven(world, DRIVE, LIFT) as (robot, hmi, _):
+    async with driven(world, DRIVE, LIFT) as (robot, hmi, at):
         await show(tab, hmi)
         await tab.until(f"{state()} === 'free'")
         how = await tab.value(f"{of('Lift', '.stick-words')}.textContent")
@@ -50,3 +52,6 @@ async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_
         assert await tab.value(state("Lift")) == "free"
         await tab.value("window.held = false")
         await rests(robot)
+        async with open_page(at) as other:
+            await Driver(other).take()
+            await tab.until(f"{state()} === 'page 2 drives'")
