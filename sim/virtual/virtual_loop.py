@@ -125,7 +125,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def _let_time_pass(self) -> None:
         """Move the clock from timer to timer and make all calls due, while nothing else is."""
-        timers, ready, files = self._timers, self._ready, self._files  # type: ignore[attr-defined]
+        timers, ready = self._timers, self._ready  # type: ignore[attr-defined]
         while timers:
             when, _, callback, first, second = heappop(timers)
             if callback is None and first._cancelled:
