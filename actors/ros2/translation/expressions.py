@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 Read = Callable[[Any], Any]
@@ -130,7 +131,7 @@ class Expression:
             if len(self.paths) != count:
                 raise ValueError(f"{text!r}: {name} takes {count} field{'s' * (count > 1)}")
             reads = [reader(path, text) for path in self.paths]
-            whole = _called(function, reads)
+            whole: Read = partial(_applied, function, reads)
         elif found := _PATH.fullmatch(body):
             self.paths = (found[1],)
             whole = reader(found[1], text)
@@ -152,12 +153,8 @@ class Expression:
                              ) from None
 
 
-def _called(function: Callable[..., Any], reads: Sequence[Read]) -> Read:
-    """Return a function that applies another one to one or two values of a message."""
-    one, two = reads[0], reads[-1]
-    if len(reads) == 1:
-        return lambda message: function(one(message))
-    return lambda message: function(one(message), two(message))
+def _applied(function: Callable[..., Any], reads: Sequence[Read], message: Any) -> Any:
+    return function(*[read(message) for read in reads])
 
 
 def steps(path: str, text: str = "") -> list[str | int]:

@@ -141,13 +141,6 @@ def test_what_is_no_recorded_message_is_refused(text):
         form_of(topics.POSE.at()).payload(text)
 
 
-def test_every_key_is_known_by_its_topic_and_strange_ones_are_not():
-    for topic in topics.ALL:
-        assert form_of(topic.at("DM1") if topic.is_family else topic.at()).topic is topic
-    assert [form_of(key).topic for key in (
-        "rampart/detection", "rampart/detection/", "rampart/detection/a/b", "x")] == [None] * 4
-
-
 def test_a_later_lap_is_a_later_life_and_nothing_else_of_the_message_changes():
     payload = encode(Header("DM1", 2, 7, 3.0), m.Pose(1.0, 2.0, float("inf")))
     assert renumbered(payload, 3, 10.0) == encode(
