@@ -7,6 +7,7 @@ reduced speed, and Osmosis Control is killed. The film shows a kill of Localizat
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import io
 import sys
@@ -103,7 +104,9 @@ async def take(run: RealRun, into: Path) -> None:
 
 def main() -> int:
     """Run, and take the pictures."""
-    into = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("directory", type=Path, nargs="?", default=ROOT / "docs" / "images")
+    into: Path = parser.parse_args().directory
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, RealRun(
             Path(folder), "osmosis", "--rate", f"{RATE:g}", "--hmi-port", str(PAGE_PORT),

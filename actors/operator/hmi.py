@@ -21,9 +21,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 
+from rampart.actors.access.register import KeysError
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -200,8 +202,22 @@ class Hmi(Actor):
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "badge": self.badge,
                 "system": one_line(self.context.run.system.name),
-                "tables": self._state.picture.tables,
+                "expires": self._expires(), "tables": self._state.picture.tables,
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
+
+    def _expires(self) -> tuple[str, float] | None:
+        """Return the certificate of the run that expires first, and the time (Unix time)."""
+        plan, ends = self.context.run.plan, {}
+        if self._tls is not None:
+            ends["page"] = self._tls.says.until_s
+        if plan.keys:
+            with contextlib.suppress(ImportError, KeysError, OSError):
+                from rampart.actors.access import key_folder  # noqa: PLC0415 of an extra
+
+                names = (*ROUTERS, *(actor.name for actor in self.context.run.system.actors()))
+                ends |= {name: until.timestamp() for name, until
+                         in key_folder.lifetimes(Path(plan.keys), names).items()}
+        return min(ends.items(), key=lambda end: end[1], default=None)
 
     def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
         """Act on a request of the page with a number, and return the answer.

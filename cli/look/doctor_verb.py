@@ -32,6 +32,7 @@ EXTRAS = {
     "ros2": ("rosbags", "no gateway to ROS 2"),
     "foxglove": ("foxglove", "no `rampart live foxglove`"),
     "prometheus": ("prometheus_client", "no `rampart live metrics`"),
+    "export": ("pyarrow", "no `rampart bag export --to parquet`"),
     "video": ("imageio_ffmpeg", "no `rampart replay --video`"),
     "search": ("optuna", "no `rampart campaign --search`")}
 """Extra → its module, and the consequence if it is not installed."""

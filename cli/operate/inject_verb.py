@@ -46,7 +46,9 @@ from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_fault
 
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
-_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt"}
+_SECONDS = "must be seconds above 0"
+_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt", "add": "corrupt",
+            "ramp": "corrupt", "noise": "corrupt"}
 """Option → the mode that it details."""
 
 STOPPED_S = 5.0
@@ -55,7 +57,7 @@ STOPPED_S = 5.0
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, also during its restart."""
 
-_OF_TOPICS = ("share", "seed", "delay", "stamp", "set")
+_OF_TOPICS = ("share", "on", "off", "seed", *_DETAILS)
 """Options of a fault of a topic."""
 
 
@@ -75,13 +77,21 @@ def add(verbs: Any) -> None:
         JSON,
         group("which messages",
               number("--share", "P", "probability that a message is affected (default: 1)"),
+              number("--on", "S", "with --off: in force for S, repeatedly"),
+              number("--off", "S", "with --on: then absent for S"),
               option("--seed", type=int, metavar="N", help="seed of random choices: share, "
-                     "and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
+                     "noise, and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
         group("details of MODE:TOPIC",
               number("--delay", "S", "delay: simulated seconds (default: 1.5)"),
               number("--stamp", "S", "restamp: simulated seconds that are added to each stamp "
                      "(default: random)"),
-              several("--set", "FIELD=VALUE", "corrupt: overwrite a field; repeatable")))
+              several("--set", "FIELD=VALUE",
+                      "corrupt: overwrite a field; repeatable, as all below"),
+              several("--add", "FIELD=BIAS",
+                      "corrupt: add BIAS to a number, or to each number of an array"),
+              several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
+              several("--noise", "FIELD=SIGMA",
+                      "corrupt: add Gaussian noise of this standard deviation")))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
@@ -156,6 +166,10 @@ def choose(options: argparse.Namespace) -> Fault:
     """
     if options.share is not None and not 0 < options.share <= 1:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
+    if (options.on is None) != (options.off is None):
+        raise UsageError("--on S and --off S: expected both or none")
+    positive("--on", options.on, _SECONDS, math.inf)
+    positive("--off", options.off, _SECONDS, math.inf)
     mode, colon, key = options.fault.partition(":")
     detailed = [name for name in _DETAILS if getattr(options, name) not in (None, [])]
     for name in detailed:
@@ -168,28 +182,35 @@ def choose(options: argparse.Namespace) -> Fault:
     else:
         fault = faults_of(systems.at_hand(None, options.port)).find(
             options.fault, options.seed or 0, known)
-    return fault.varied(share=options.share)
+    return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
 
 def _detailed(mode: str, name: str, known: Sequence[Topic[Any]], options: argparse.Namespace
               ) -> Fault:
     topic, key = resolve(name, known)
-    positive("--delay", options.delay, "must be seconds above 0", math.inf)
+    positive("--delay", options.delay, _SECONDS, math.inf)
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
+        add_fields=dict(_amount("--add", text, topic) for text in options.add),
+        ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
+        noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
         seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     if reason := flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type):
         raise UsageError(f"{options.fault}: {reason}")
     return Fault(f"{mode}:{disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
 
 
-def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
-    """Return field and value of `--set`."""
+def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
+    """Return field, value as text, and type of the field."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise UsageError(f"--set {text}: expected FIELD=VALUE")
-    kind = field_type(topic.type, name).declared
+        raise UsageError(f"{option} {text}: expected FIELD=VALUE")
+    return name, value, field_type(topic.type, name).declared
+
+
+def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
+    name, value, kind = _split("--set", text, topic)
     if is_array(name, kind):
         kind = float  # it fills the array
     if bare(kind) is str:
@@ -202,6 +223,14 @@ def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
         except msgspec.ValidationError as error:
             raise UsageError(f"--set {text}: {error}") from None
     return name, msgspec.to_builtins(found)
+
+
+def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
+    name, value, _ = _split(option, text, topic)
+    try:
+        return name, float(value)
+    except ValueError:
+        raise UsageError(f"{option} {text}: expected FIELD=NUMBER") from None
 
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:

@@ -1,7 +1,8 @@
-"""A recording as tables for spreadsheets and pandas: one CSV file per topic, one row per message.
+"""A recording as tables for spreadsheets and pandas: one file per topic, one row per message.
 
 The first column is `time_s`: simulated seconds, or wall-clock seconds in files of other tools. The
 others are the fields of the message, with dots if nested: `body.x_m`. A list is JSON in a cell.
+Parquet, by the extra `export`, has the same tables.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import msgspec
 
 from rampart.actors.recording.bag_reader import BagReader, key_of, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, complete
+from rampart.cli.verbs import extra
 
 Row = dict[str, Any]
 
@@ -41,23 +43,37 @@ class Export:
         self._reader = reader
         self._wants = wants
 
-    def write(self, folder: Path) -> None:
+    def write(self, folder: Path, kind: str) -> None:
         """Write the tables into a new folder, or no folder.
+
+        Args:
+            folder: must not exist.
+            kind: `csv` or `parquet`.
 
         Raises:
             BagError: the folder exists or cannot be written, or the recording cannot be read.
+            UsageError: the extra is not installed.
         """
+        convert = _to_parquet() if kind == "parquet" else None
         if folder.exists():
             raise BagError(f"{folder}: exists already; choose another name")
-        with complete(folder), ExitStack() as files:
+        with complete(folder):
             folder.mkdir()
-            columns: dict[str, Row] = {}
-            for topic, row in self._rows():
-                columns.setdefault(topic, {}).update(dict.fromkeys(row))
+            for path in self._write_csv(folder):
+                if convert:
+                    convert(path)
+                    path.unlink()
+
+    def _write_csv(self, folder: Path) -> list[Path]:
+        columns: dict[str, Row] = {}
+        for topic, row in self._rows():
+            columns.setdefault(topic, {}).update(dict.fromkeys(row))
+        paths = _paths(folder, columns)
+        with ExitStack() as files:
             tables = {
                 topic: csv.DictWriter(files.enter_context(
                     path.open("w", newline="", encoding="utf-8")), list(columns[topic]))
-                for topic, path in _paths(folder, columns).items()}
+                for topic, path in paths.items()}
             for table in tables.values():
                 table.writeheader()
             for topic, row in self._rows():
@@ -65,6 +81,7 @@ class Export:
                     name: msgspec.json.encode(value).decode() if isinstance(value, list) else value
                     for name, value in row.items()})
                 self.counts[topic] += 1
+        return list(paths.values())
 
     def _rows(self) -> Iterator[tuple[str, Row]]:
         """Yield topic and row of each message."""
@@ -90,6 +107,17 @@ class Export:
     def _leave_out(self, topic: str, why: str) -> None:
         count, first = self.left_out.get(topic, (0, why))
         self.left_out[topic] = count + 1, first
+
+
+def _to_parquet() -> Callable[[Path], None]:
+    """Return a function that writes a CSV file's table beside it."""
+    tables = extra("export", "pyarrow.csv")
+    parquet = extra("export", "pyarrow.parquet")
+
+    def convert(path: Path) -> None:
+        parquet.write_table(tables.read_csv(path), path.with_suffix(".parquet"))
+
+    return convert
 
 
 def _flat(name: str, value: Any) -> Row:

@@ -6,7 +6,7 @@ of other programs.
 Examples:
   rampart bag info run.mcap
   rampart bag repair torn.mcap whole.mcap
-  rampart bag export run.mcap
+  rampart bag export run.mcap --to parquet
 """
 
 from __future__ import annotations
@@ -101,10 +101,12 @@ def add(verbs: Any) -> None:
              option("file", metavar="IN", help="MCAP file"),
              option("out", metavar="OUT", help="new file"),
              flag("--overwrite", "replace OUT if it exists"))
-    add_verb(bag, "export", "write tables in CSV", bag_export,
+    add_verb(bag, "export", "write tables in CSV or Parquet", bag_export,
              option("file", metavar="IN", help="MCAP file"),
              option("out", metavar="FOLDER", nargs="?",
                     help="new folder (default: IN without its suffix)"),
+             option("--to", choices=("csv", "parquet"), default="csv",
+                    help="format (default: csv)"),
              option("--topics", **_TOPICS, help="write only channels that match a pattern"), JSON)
 
 
@@ -347,13 +349,14 @@ def bag_repair(options: argparse.Namespace) -> int:
 def bag_export(options: argparse.Namespace) -> int:
     """Write a recording as tables.
 
-    Write one CSV file per topic into a new folder, with one row per message. The
-    first column is simulated time; the others are the fields of the message, such
-    as body.x_m. Channels for viewers (view/…) are written only with --topics.
+    Write one file per topic into a new folder, with one row per message. Format is
+    CSV, or Parquet with the extra: pip install 'rampart-robot[export]'. The first
+    column is simulated time; the others are the fields of the message, such as
+    body.x_m. Channels for viewers (view/…) are written only with --topics.
 
     Examples:
       rampart bag export run.mcap
-      rampart bag export run.mcap tables --topics 'localization/*'
+      rampart bag export run.mcap tables --to parquet --topics 'localization/*'
 
     exit code: 0 all was written, 1 a damaged part was left out, 2 bad usage
     """
@@ -364,7 +367,7 @@ def bag_export(options: argparse.Namespace) -> int:
     if options.topics:
         wants = matcher(options.topics, [row["channel"] for row in Summary(reader).table()])
     done = Export(reader, wants)
-    done.write(folder)
+    done.write(folder, options.to)
     return _copied(options, folder, done.counts, done.left_out, reader)
 
 

@@ -22,6 +22,7 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.runs.curves import Curve
 
 KEPT = 10_000
 """Most events, intervals, decisions or names of a kind in a record."""
@@ -97,6 +98,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         faults: Planned faults and their outcomes.
         keeping_up: Whether the machine kept up with the rate; None in virtual time.
         audit: Audit log of the operator's page.
+        curves: Numbers of the robot; empty if its report draws others.
     """
 
     run_id: str
@@ -116,6 +118,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     faults: tuple[FaultOutcome, ...] = ()
     keeping_up: KeptUp | None = None
     audit: tuple[AuditLine, ...] = ()
+    curves: tuple[Curve, ...] = ()
 
 
 class RunRecorder:

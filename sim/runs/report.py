@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -76,7 +77,7 @@ def render(run: RunRecord, title: str, margins: Sequence[tuple[str, str]] = ()) 
     """
     return environment().get_template("runs/report.html").render(
         run=run, title=title, margins=margins, headline=_headline(run), lanes=lanes_of(run),
-        ticks=ticks_of(run.duration_s))
+        ticks=ticks_of(run.duration_s), plots=plots_of(run))
 
 
 def _headline(run: RunRecord) -> str:
@@ -147,6 +148,21 @@ def lanes_of(run: RunRecord) -> list[dict[str, Any]]:
                 "kind": kind, "label": label, "name": name, "bars": []})
             lane["bars"].append(bar(interval))
     return list(lanes.values())
+
+
+def plots_of(run: RunRecord) -> list[dict[str, Any]]:
+    """Return the curves of a run by plot: its ends, and each curve in a box of 600 x 120."""
+    plots = []
+    for title, curves in groupby(run.curves, key=lambda curve: curve.plot):
+        drawn = list(curves)
+        values = [value for curve in drawn for _, value in curve.points]
+        low, high = min(values), max(values)
+        x, y = 600 / max(run.duration_s, 1e-9), 116 / ((high - low) or 1.0)
+        plots.append({"title": title, "low": f"{low:.4g}", "high": f"{high:.4g}", "lines": [
+            {"field": curve.field, "points": " ".join(
+                f"{t * x:.1f},{118 - (value - low) * y:.1f}" for t, value in curve.points)}
+            for curve in drawn]})
+    return plots
 
 
 def ticks_of(duration_s: float) -> list[dict[str, Any]]:

@@ -40,6 +40,7 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
+from rampart.sim.runs.curves import CurveRecorder
 from rampart.sim.runs.judge import UNSTABLE, Judge, Verdict
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
@@ -67,6 +68,7 @@ class Trial:
         margins: Heading in reports of each margin, by name.
         margin_unit: Unit of all margins.
         exact_below: A margin from this value on may be a lower bound; None if all are exact.
+        draws: Whether the report has curves of all numbers of the robot.
         resumes: Whether a resumed run continues the record of the part before.
         pictures: Class path of the `RunPictures` in a campaign's report; "" for none.
 
@@ -92,6 +94,7 @@ class Trial:
     margins: ClassVar[Mapping[str, str]] = {}
     margin_unit: ClassVar[str] = "m"
     exact_below: ClassVar[float | None] = None
+    draws: ClassVar[bool] = True
     resumes: ClassVar[bool] = True
     pictures: ClassVar[str] = ""
 
@@ -109,6 +112,7 @@ class Trial:
         self.injects: Injector | None = None
         self._outcomes_before: tuple[FaultOutcome, ...] = ()
         self._brought_back = 0
+        self._curves = CurveRecorder(system_topics(run.system) if self.draws else ())
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
         # The process of a world is restarted only if a recovery module owns it.
         self._mortal = frozenset(
@@ -122,7 +126,7 @@ class Trial:
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return the receivers of the run's messages."""
         del clock
-        return [self._look_at_world, self.recorder.feed,
+        return [self._look_at_world, self.recorder.feed, self._curves.take,
                 *([self.console.take] if self.console else ())]
 
     def _look_at_world(self, topic: Topic[Any], message: Any, header: Header) -> None:
@@ -162,7 +166,7 @@ class Trial:
 
         spec, observers = self.run.system, context(OBSERVER)
         kind = observer_class(spec)
-        judged = {t.key: t for t in judged_topics(spec, kind)}
+        judged = self._curves.topics | {t.key: t for t in judged_topics(spec, kind)}
         observers = replace(observers, parameters={"judged": list(judged)}, topics=judged)
         actors: list[Actor] = [kind(observers, [take, *self.sinks(observers.clock)])]
         if scenario:
@@ -247,6 +251,7 @@ class Trial:
         """Return the fields of a record that do not come from messages."""
         log = self.run.plan.page.audit_log
         return {"faults": self.outcomes(), "audit": read_audit(Path(log)) if log else (),
+                "curves": self._curves.curves(),
                 "keeping_up": self._keeping_up.result(now_s) if self._keeping_up else None}
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:

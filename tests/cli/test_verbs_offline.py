@@ -89,6 +89,8 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "weak-wheel:nose"], ["unknown wheel 'nose'; known: front-left"]),
     (["inject", "stuck-wheel", "--share", "0.5"], ["--share: only with a fault of a topic"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
+    (["inject", "wrong-graph", "--on", "1"], ["--off"]),
+    (["inject", "wrong-graph", "--on", "1", "--off", "inf"], ["--off inf"]),
     (["inject"], ["--list"]),
     (["inject", "wrong-graph", "--duration", "-1"], ["--duration -1"]),
     (["inject", "drop:detection/*"], ["no topic"]),
@@ -98,6 +100,8 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
      ["'z_m'", "x_m, y_m, yaw_rad"]),
     (["inject", "corrupt:localization/pose", "--set", "x_m=east"],
      ["x_m=east", "float"]),
+    (["inject", "corrupt:plan/route", "--ramp", "step=1"], ["float"]),
+    (["inject", "corrupt:localization/pose", "--noise", "x_m=-1"], ["'x_m' = -1", "0 or more"]),
     (["inject", "slow:pump"], ["only in virtual time: --virtual --fault slow:pump"]),
     (["inject", "kill:pump@3"], ["injected now; expected --duration S instead of @WHEN or +S"]),
     (["inject", "kill:pump", "--duration", "3"], ["--duration 3: kill ends when the node is"]),
@@ -145,11 +149,14 @@ NOISE = SENSOR_FAULTS["gps-noise"].disturbances[0]
 
 
 @pytest.mark.parametrize(("arguments", "order"), [
-    (["gps-noise", "--share", "0.3", "--seed", "7"], {
-        "share": 0.3, "seed": 7, "noise_fields": NOISE.noise_fields}),
-    (["corrupt:summit_xl/scan", "--set", "ranges_f32=0.4", "--seed", "3"], {
-        "topic": "summit_xl/scan", "mode": "corrupt", "duration_s": 4.0, "seed": 3,
-        "set_fields": {"ranges_f32": 0.4}}),
+    (["gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"], {
+        "share": 0.3, "on_s": 1.0, "off_s": 4.0, "seed": 7, "noise_fields": NOISE.noise_fields}),
+    (["corrupt:summit_xl/scan", "--add", "ranges_f32=0.4", "--noise", "ranges_f32=0.2", "--set",
+      "range_max_m=9", "--seed", "3"], {
+          "topic": "summit_xl/scan", "mode": "corrupt", "duration_s": 4.0, "seed": 3,
+          "set_fields": {"range_max_m": 9.0}, "add_fields": {"ranges_f32": 0.4},
+          "noise_fields": {"ranges_f32": 0.2}}),
+    (["corrupt:summit_xl/odom", "--ramp", "pose.x_m=0.5"], {"ramp_fields": {"pose.x_m": 0.5}}),
     (["corrupt:rampart/plan/route", "--set", "reason=why not", "--set",
       "step=3"], {"topic": "plan/route", "set_fields": {"reason": "why not", "step": 3}}),
 ])

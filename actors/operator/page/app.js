@@ -34,6 +34,7 @@ let retryMs = 500;
 let retry = 0;
 let lastHeard = 0;
 let toastTimer = 0;
+let expires = null;          // the certificate of the run that expires first, and the time
 let badge = "";              // kind of the connection: live, or replay
 
 const OLD_MS = 1700;         // the HMI sends at least one frame per second
@@ -166,6 +167,7 @@ async function hello(message) {
   tooMuch = message.left_out || {};
   leftOut({});
   say($("system"), message.system);
+  expires = message.expires;
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
   await panels.begin(message);
   if (socket !== from) return;  // lost in the meantime
@@ -187,6 +189,7 @@ const PARTS = [
     order.show(s.manager);
   }],
   [["nodes", "usage"], (s) => processes.show(s.nodes, s.usage)],
+  [["usage"], credentials],
   [["history"], (s) => showHistory($("history"), $("history-panel"), s.history)],
   [["behind"], (s) => {
     $("behind").hidden = !s.behind;
@@ -217,6 +220,15 @@ function leftOut(counts) {
   const missing = [...Object.entries(tooMuch), ...Object.entries(counts)];
   $("left-out").hidden = !missing.length;
   say($("left-out"), `Too much to show: ${missing.map(([what, n]) => `${n} of the ${what}`).join(", ")} left out.`);
+}
+
+/** Show the days of validity of the run's credentials. */
+function credentials() {
+  $("credentials").hidden = !expires;
+  if (!expires) return;
+  const days = (expires[1] - Date.now() / 1000) / 86400;
+  pill("credentials", days < 3 ? "bad" : days < 7 ? "warn" : "", `credentials: ${days < 0 ? "expired" : `${days.toFixed(days < 10 ? 1 : 0)} days left`}`);
+  $("credentials").title = `The certificate of ${expires[0]} expires first, at ${new Date(1000 * expires[1]).toISOString()}.`;
 }
 
 function told(outcome) {

@@ -300,6 +300,7 @@ class MissionTrial(Trial):
     recorder: MissionRecorder
     judges = True
     patient = True
+    draws = False
     injector = OsmosisInjector
     tells = MissionConsole
     retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}

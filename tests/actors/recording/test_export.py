@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 
 import pytest
+from pyarrow import parquet
 
 from rampart.cli.main import main
 from tests.actors.recording.samples import foreign
@@ -37,6 +39,17 @@ def test_each_topic_is_a_table_with_one_row_per_message(recording, capsys):
         "0.1", "localization", "3.0")
     assert rows[3]["body.yaw_rad"] == "", "NaN"
     assert [row["error"] != "" for row in rows].count(True) == 1, "the message that is garbage"
+
+
+def test_parquet_has_the_rows_of_csv_as_numbers(recording, tmp_path):
+    for kind in ("csv", "parquet"):
+        assert main(["bag", "export", str(recording), str(tmp_path / kind), "--to", kind]) == 0
+    for path in (tmp_path / "csv").iterdir():
+        rows = parquet.read_table(tmp_path / "parquet" / f"{path.stem}.parquet").to_pylist()
+        assert [float(row["time_s"]) for row in table(path)] == [row["time_s"] for row in rows]
+    assert not list((tmp_path / "parquet").glob("*.csv"))
+    poses = parquet.read_table(tmp_path / "parquet" / "localization-pose.parquet").to_pylist()
+    assert poses[2]["body.x_m"] == pytest.approx(3.0)
 
 
 def test_what_cannot_be_in_a_table_is_left_out_and_named(tmp_path, capsys):
@@ -71,9 +84,11 @@ def test_topics_are_chosen_and_a_damaged_recording_is_exported_as_far_as_it_goes
 
 @pytest.mark.parametrize(("words", "told"), [
     (["there"], "there: exists already"), (["no/such/place"], "No such file or directory"),
-    (["new", "--topics", "nothing"], "--topics nothing: matches no topic")])
+    (["new", "--topics", "nothing"], "--topics nothing: matches no topic"),
+    (["new", "--to", "parquet"], "pip install 'rampart-robot[export]'")])
 def test_an_export_that_cannot_be_is_refused_in_one_line(
         recording, monkeypatch, refused, words, told):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     monkeypatch.chdir(recording.parent)
     (recording.parent / "there").mkdir()
     assert told in refused("bag", "export", recording, *words)
