@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from tests import system_file
+from tests.documents.page import Page
 
 ON_GROUND = ("hmi", "teleoperation", "DM5", "DM10", "DM11", "DM13")
 
@@ -12,41 +13,14 @@ _PATIENT = """event = "non_control_node_crash"
 against = { within_s = 5.0, hazard = "the operator has neither page nor stick" }"""
 
 
-HOME_WHEN_LOST = """[[detection]]
-name = "DM15"
-title = "No link to the ground station"
-actor = "rampart.actors.detection.link_lost:LinkLost"
-within_s = 6.2
-parameters = { host = "ground", for_s = 5.0 }
-
-[[recovery]]
-name = "RM9"
-title = "Return home"
-actor = "rampart.actors.osmosis.recovery.return_home:ReturnHome"
-kind = "forward"
-claims = ["mission"]
-needs = ["mission_manager", "graph_planner"]
-deadline_s = 2.0
-escalate_to = "RM2"
-
-[[mechanism]]
-name = "FTM15"
-detect = "DM15"
-recover = "RM9"
-event = "link_lost"
-against = { within_s = 10.0, hazard = "nobody watches the robot" }
-
-[[event]]
-name = "link_lost"
-title = "Nobody can reach the robot"
-
-"""
+HOME_WHEN_LOST = Page("how-to/several-machines").of("toml")[1]
+"""The mechanism for a lost link that this page shows."""
 
 
 def home_when_lost(text: str) -> str:
     """Return the full system's specification with a robot that goes home when none can reach it."""
     for old, new in (
-            ("[[detection]]\n", f"{HOME_WHEN_LOST}[[detection]]\n"),
+            ("[[detection]]\n", f"{HOME_WHEN_LOST}\n[[detection]]\n"),
             ('"overload"]', '"overload", "link_lost"]'),
             ('RM8 = ["RM3", "RM4"]', 'RM8 = ["RM9"]\nRM9 = ["RM3", "RM4"]')):
         assert old in text

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import tomllib
 
 import pytest
 
@@ -87,8 +86,3 @@ def test_a_recording_is_made_repaired_and_written_as_tables(tmp_path, monkeypatc
     capsys.readouterr()
     assert "left behind: nothing" in follow(capsys, "recordings")
     assert list(tmp_path.glob("*/*.csv"))
-
-
-def test_the_mechanism_for_a_lost_link_is_the_tested_one():
-    shown = HOW_TO["several-machines"].of("toml")[1]
-    assert tomllib.loads(shown) == tomllib.loads(two_hosts.HOME_WHEN_LOST)

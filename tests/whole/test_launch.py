@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -17,22 +16,6 @@ from tests import ROOT
 from tests.real_tools import printed
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(240)]
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_nothing_is_left_two_seconds_after_any_end(tmp_path, number):
-    before = set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))
-    with RealRun(tmp_path, "paper", "--mission", "A") as run:
-        run.wait_for("goal 1/3")
-        folder = Path(run.info.folder)
-        assert folder.exists()
-        run.process.send_signal(number)
-        run.process.wait(3)
-        run.wait_until(
-            lambda: find_processes(run.port) == []
-            and f"rampart.{run.port}." not in Path("/proc/net/unix").read_text()
-            and not folder.exists(), 2, "processes or sockets were left")
-    assert (set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))) == before
-
 
 def test_nodes_come_back_although_root_and_watching_process_are_stopped(tmp_path):
     with RealRun(tmp_path, "osmosis", "--mission", "A") as run:

@@ -512,7 +512,11 @@ async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped
             if stopped is None or set(one.names) & set(stopped):
                 os.kill(one.pid, signal.SIGSTOP)
         root.kill()
-        await eventually(lambda: find_processes(port) == [] and not Path(folder).exists(), 2.0)
+        await eventually(
+            lambda: find_processes(port) == [] and not Path(folder).exists()
+            and f"rampart.{port}." not in Path("/proc/net/unix").read_text()
+            and not list(Path("/dev/shm").glob(f"rampart-{port}-*"))
+            and not list(Path("/tmp").glob(f"*rampart*{port}*")), 2.0)
     assert not [run for run in find_runs() if run.base_port == port]
 
 
