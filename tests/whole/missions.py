@@ -1,7 +1,9 @@
-"""Missions that are short enough for a test, on the shipped airport."""
+"""Missions that are short enough for a test, on the shipped airport; and a disk that is full."""
 
 from __future__ import annotations
 
+import resource
+from collections.abc import Callable
 from pathlib import Path
 
 SHORT_LIGHTS = {"A01": "ok", "A02": "ok", "A03": "out"}
@@ -34,3 +36,8 @@ def write_row_mission(directory: Path) -> Path:
     file = directory / "ROW.miss"
     file.write_text("x=-22,y=-18.5,taxi=1\nx=23.5,y=-18.5,taxi=0\n")
     return file
+
+
+def small_files(size: int) -> Callable[[], None]:
+    """Have no file of a process be larger: as on a full disk, writing fails."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))

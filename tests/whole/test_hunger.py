@@ -1,24 +1,30 @@
-"""A system that runs out of something, or has a member that takes too much, or nothing.
-
-Processor time is the subject of `tests/whole/test_overload.py`.
-"""
+"""A system that runs out of something, or has a member that takes too much, or nothing."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import resource
+import shutil
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+import psutil
 import pytest
 
 from benchmarks.bus_flood import FLOOD, JOIN, KINDS, PER_S, Watch
 from rampart.actors.bus.zenoh_session import ROUTERS
+from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.session import connect
 from rampart.manager.spec.specification import check_document, read_document
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.access.keyed import layout_of, make_keys
-from tests.whole.hunger import OwnClock, fill, member, no_descriptor_left, processes, small_disk
 from tests.whole.missions import write_taxi_mission
 
 pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(500)]
@@ -34,6 +40,92 @@ with join() as session:
     print("here", flush=True)
     time.sleep(1000)
 """
+
+class OwnClock:
+    """A time of day for a run alone, which may jump."""
+
+    def __init__(self, folder: Path) -> None:
+        compiler = shutil.which("cc")
+        if compiler is None:
+            pytest.skip("no C compiler: the time of day cannot be changed for one run alone")
+        library, self._file = folder / "clock_shift.so", folder / "shift"
+        subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", str(library),
+                        str(Path(__file__).with_name("clock_shift.c"))], check=True)
+        self.before_command = ("env", f"LD_PRELOAD={library}", f"SHIFT_FILE={self._file}")
+        self._file.write_bytes(bytes(8))
+
+    def jump(self, shift_s: int) -> None:
+        """Be so far off the true time from now on."""
+        with self._file.open("r+b", buffering=0) as shift:
+            shift.write(shift_s.to_bytes(8, sys.byteorder, signed=True))
+
+
+@contextmanager
+def small_disk(folder: Path, size_mb: int) -> Iterator[Path]:
+    """Mount a file system that is soon full."""
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size_mb}m,mode=0700", "tmpfs", str(folder)],
+        check=False, capture_output=True, text=True)
+    if mounted.returncode:
+        pytest.skip(f"no file system may be mounted here: {mounted.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def fill(folder: Path) -> Path:
+    """Write a file until the disk is full."""
+    file = folder / "filler"
+    with file.open("wb", buffering=0) as filler:
+        try:
+            while True:
+                filler.write(bytes(4096))
+        except OSError:
+            return file
+
+
+def processes(run: RealRun) -> dict[str, psutil.Process]:
+    """Return the processes of a run that are there now, the launcher among them."""
+    found = {" ".join(p.names): psutil.Process(p.pid) for p in find_processes(run.port)}
+    return found | {"launcher": psutil.Process(run.process.pid)}
+
+
+@contextmanager
+def no_descriptor_left(run: RealRun) -> Iterator[None]:
+    """Let no process of a run open anything more."""
+    held = processes(run)
+    before = {pid: resource.prlimit(pid, resource.RLIMIT_NOFILE)
+              for pid in (process.pid for process in held.values())}
+    for pid, (_, hard) in before.items():
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        yield
+    finally:
+        for pid, limits in before.items():
+            if psutil.pid_exists(pid):
+                resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+
+
+@contextmanager
+def member(run: RealRun, script: str, *arguments: str, key: str | Path = ""
+           ) -> Iterator[subprocess.Popen[str]]:
+    """Run a script that is told the port of a run to join; wait until it says it is there.
+
+    Args:
+        key: with which it joins a run with keys.
+    """
+    with subprocess.Popen([sys.executable, "-c", script, *arguments, str(run.port)],
+                          env={**os.environ, "RAMPART_KEY": str(key)},
+                          stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "here\n"
+            yield process
+        finally:
+            process.kill()
+
 
 def succeeds(run: RealRun) -> dict[str, object]:
     """Wait for the end, and see that it is a good one."""
@@ -157,3 +249,45 @@ async def _stops(port: int, count: int) -> list[float]:
             took_s.append(found)
             await asyncio.wait_for(watch.release(), 30.0)
         return took_s
+
+
+@contextmanager
+def busy_processes(*, in_sessions: bool) -> Iterator[None]:
+    """Keep many processes busy.
+
+    Args:
+        in_sessions: each in a session of its own, as those of other users are. Where the kernel
+            shares the processors between sessions (`sched_autogroup_enabled`, sched(7)), many of
+            them leave hardly anything; in one session with the system its processes compete with
+            each one by itself, and those that sleep a lot run soon when they wake.
+    """
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"],
+                             start_new_session=in_sessions) for _ in range(64)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+        for process in busy:
+            process.wait()
+
+
+@contextmanager
+def second_system(folder: Path) -> Iterator[None]:
+    """Drive another mission on the same machine."""
+    folder.mkdir()
+    with RealRun(folder, "osmosis", "--rate", "2"):
+        yield
+
+
+@pytest.mark.parametrize(("kind", "rate"), [("busy", 2), ("sessions", 1), ("second", 2)])
+def test_the_mission_goes_on_after_an_overload(tmp_path, kind, rate):
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path)), "--rate",
+                 str(rate), "--patience", "90") as run:
+        run.wait_for("goal 1/")
+        run.sleep_until(3.0)
+        with (second_system(tmp_path / "second") if kind == "second"
+              else busy_processes(in_sessions=kind == "sessions")):
+            time.sleep(15.0)
+        _, result = run.result(300)
+    assert (result["mission"], result["safety"]) == ("success", "safe"), run.story

@@ -19,8 +19,7 @@ from rampart.actors.supervision.process_title import RUN, find_processes
 from rampart.testing import wait_until
 from tests import ROOT
 from tests.whole.chaos import complaints
-from tests.whole.hunger import small_files
-from tests.whole.missions import write_near_mission, write_short_mission
+from tests.whole.missions import small_files, write_near_mission, write_short_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(300)]
 

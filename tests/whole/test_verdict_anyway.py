@@ -21,8 +21,7 @@ from rampart.cli import run as launch
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.hunger import small_files
-from tests.whole.missions import write_short_mission
+from tests.whole.missions import small_files, write_short_mission
 
 UNSAFE = 3
 
