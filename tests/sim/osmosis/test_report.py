@@ -125,18 +125,6 @@ def test_crashes_detections_and_faults_are_bars_from_their_begin_to_their_end():
         assert text in texts
 
 
-def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
-    story = Story()
-    story.truth(0.0, 0.0, 0.0)
-    assert story.end().obstacle_clearance_m is None
-    story.truth(1.0, 1.0, 0.0, obstacle_clearance_m=0.4, prohibited_clearance_m=-0.2,
-                collisions=1, prohibited_s=0.5)
-    story.truth(2.0, 2.0, 0.0)
-    run = story.end()
-    assert (run.obstacle_clearance_m, run.prohibited_clearance_m) == (0.4, -0.2)
-    assert (run.collisions, run.prohibited_s) == (1, 0.5)
-
-
 def full_story(run_id: str = "r1") -> Story:
     story = Story(run_id)
     for i in range(200):

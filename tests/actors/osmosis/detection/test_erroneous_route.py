@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 import msgspec
@@ -11,16 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute, RouteMonitor
+from rampart.actors.osmosis.detection.erroneous_route import RouteMonitor
 from rampart.actors.osmosis.detection.mission_consistency import (
     ConsistencyLimits,
     ConsistencyMonitor,
 )
 from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
-from rampart.testing import Ear, play, run, table, wake
-from tests.osmosis_system import System
+from rampart.testing import play, table, wake
 
 AIRPORT = load_airport("vallombre")
 GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))
@@ -80,27 +77,6 @@ def test_who_gave_a_wrong_goal_is_to_blame_for_the_bad_route_to_it(goal, status,
     monitor.goal(m.GoalOrder("m1", 0, GOALS[0], True), "mission_manager", 4)
     routes(monitor)("g", 1.1)
     assert monitor.active == blamed.startswith("graph"), "a new life of the manager is believed"
-
-
-def test_a_way_across_the_grass_is_reported_at_once_on_a_map_of_its_own():
-    start, goal = (-27.0, 11.0), (-22.0, -18.5)
-
-    async def scenario():
-        async with System(airport=AIRPORT) as system:
-            ear = system.start("ear", Ear)
-            system.start("DM10", ErroneousRoute)
-            await system.settle()
-            system.say(topics.GOAL, m.GoalOrder("m1", 0, Goal(*goal, Mode.TAXI), True))
-            before_s = system.clock.now()
-            system.say(topics.ROUTE, m.Route("m1", 0, Mode.TAXI, True, (start, goal), ""),
-                       "graph_planner")
-            await asyncio.sleep(0.05)
-            at_s, report = ear.heard[-1]
-            assert at_s - before_s < 0.01
-            assert report.nodes == ("graph_planner#1",)
-            assert "crosses the prohibited area" in report.reason
-
-    run(scenario)
 
 
 # ---- DM11 ---------------------------------------------------------------------------------------

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 import pytest
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.estimation_error import (
-    EstimationError,
     EstimationMonitor,
 )
-from rampart.testing import Ear
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
     STAMPED,
@@ -26,7 +22,6 @@ from tests.actors.osmosis.control.localization_drive import (
     mis_stamped,
     watch,
 )
-from tests.osmosis_system import in_system, shipped_system
 
 FROM_S = 4.0
 
@@ -109,21 +104,3 @@ def test_a_respawned_module_claims_nothing_before_it_has_compared_or_waited():
     waiting = EstimationMonitor(1.0)
     waiting.expire(1.0)
     assert (waiting.known, waiting.active) == (True, False)
-
-
-@in_system(system=shipped_system())
-async def test_the_actor_names_the_life_that_lied(system):
-    ear = system.start("ear", Ear)
-    system.start("DM8", EstimationError)
-    await system.settle()
-    for i in range(40):
-        x_m = 0.1 * i
-        system.say(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
-        system.say(topics.ODOMETRY, m.Odometry(m.Pose(x_m, 0.0, 0.0), m.Twist(1.0, 0.0)))
-        system.say(topics.POSE, m.Pose(x_m, 0.0 if i < 20 else 2.0, 0.0), "localization")
-        system.say(topics.GPS, m.GpsFix(x_m, 0.0, 1.0, 0.0, 0.02))
-        await asyncio.sleep(0.1)
-    assert ear.states == ["idle", "active"]
-    report = ear.heard[-1][1]
-    assert report.nodes == ("localization#1",)
-    assert report.reason == "the pose is 2.0 m from GPS, which moves like the wheels"

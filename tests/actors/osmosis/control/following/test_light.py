@@ -44,14 +44,6 @@ def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, blind=(), inspection=N
     raise AssertionError("the row's end was not reached")
 
 
-def test_the_row_is_followed_to_its_end():
-    world = World(y_m=0.3, yaw_rad=0.4)
-    motion = drive(world, LightRow(ROW), 40)
-    assert motion.arrived
-    assert math.dist((world.x_m, world.y_m), ROW[1]) < 0.15
-    assert max(abs(y) for x, y in world.track if x > 4.0) < 0.1
-
-
 def test_the_robot_waits_for_an_obstacle_and_resumes_a_moment_after_it_is_gone():
     world = World(circles=[Circle(10.0, 0.0, 0.4)])
     row = LightRow(ROW)
