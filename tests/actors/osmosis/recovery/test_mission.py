@@ -15,7 +15,7 @@ from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.osmosis.recovery.return_home import ReturnHome
 from rampart.actors.runtime.actor import Actor, on
 from rampart.testing import run
-from tests.actors.osmosis.recovery.world import Boss
+from tests.actors.osmosis.recovery.world import Boss, hang
 from tests.osmosis_system import System
 
 AIRPORT = load_airport("vallombre")
@@ -156,3 +156,13 @@ def test_where_home_is_not_known_it_waits_for_that_until_its_deadline(late_s):
         assert manager.state.phase is MissionPhase.RETURNING
 
     come_home(scenario, mission=False)
+
+
+def test_it_fails_at_its_deadline_without_a_mission_manager():
+    async def scenario(boss, planner, manager):
+        hang(manager)
+        boss.order("RM9")
+        await asyncio.sleep(2.3)
+        assert boss.reports[-1].message.reason.endswith("no answer from the Mission Manager")
+
+    come_home(scenario)

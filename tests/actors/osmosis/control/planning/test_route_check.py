@@ -81,6 +81,8 @@ FAULTS = {
     "off the graph to the goal": (((0.0, 0.0), (20.0, 0.0), (20.0, 2.2)), None, None, ""),
     "off the graph on the way": (((0.0, 0.0), (9.0, 0.0), (9.0, 2.2), (20.0, 2.2), (20.0, 0.0),
                                   (30.0, 0.0)), None, None, "leg 2"),
+    "across the corner": (((27.5, 0.0), (30.0, 2.5), (30.0, 27.0)), None, None,
+                          "leaves the graph on the way"),
     "too far along beside it": (((0.0, 0.0), (5.0, 0.0), (25.0, 2.2)), None, None,
                                 "leg 2 from (5.0, 0.0) to (25.0, 2.2) ends off the graph"),
 }
