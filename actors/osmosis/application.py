@@ -10,16 +10,12 @@ import msgspec
 
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.application import Application
-from rampart.manager.spec.schema import SystemSpec
 
 if TYPE_CHECKING:
     from rampart.actors.osmosis.airport.model import Airport, Mission, WorldTruth
 
 _AIRPORT = "airport"
 """Folder of the airport's files in a recording."""
-
-TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
-
 
 class Osmosis(Application):
     """The airport and the mission, for the nodes of Osmosis.
@@ -42,10 +38,6 @@ class Osmosis(Application):
         obstacles: Annotated[int, msgspec.Meta(
             ge=0, description="number of the airport's obstacles on the way",
             extra={"metavar": "N", "campaign": "0,2"})] = 0
-        joystick: Annotated[str, msgspec.Meta(
-            description="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
-            "(without DEVICE: the first one); hold its left shoulder button to drive",
-            extra={"metavar": "DEVICE", "alone": "auto", "real": True})] = ""
 
     topics = topics.ROBOT
     views = "rampart.actors.osmosis.views:OsmosisViews"
@@ -56,7 +48,6 @@ class Osmosis(Application):
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     examples = (
         ("--mission A --obstacles 2", "two obstacles on the way"),
-        ("--joystick", "drive by hand: hold the left shoulder button"),
         ("--virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5", "two faults"),
         ("--airport my/airport.graph --mission my/MISSION_A.miss", "your airport"),
     )
@@ -120,27 +111,6 @@ class Osmosis(Application):
     def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Return the options without obstacles, if they have some."""
         return [{**options, "obstacles": 0}] if options.get("obstacles") else []
-
-    def check(self, spec: SystemSpec, *, virtual: bool) -> str:
-        """Refuse an unusable joystick; return a note about one that is not connected yet.
-
-        Raises:
-            ValueError: the run is virtual, no node reads it, or it is neither a device nor a FIFO.
-        """
-        name = self.options.joystick
-        if not name:
-            return ""
-        if virtual:
-            raise ValueError(f"--joystick {name}: not possible with --virtual")
-        if all(node.actor != TELEOPERATION for node in spec.nodes):
-            raise ValueError(f"--joystick {name}: no node of {spec.name} reads it")
-        device = Path(name)
-        if device.is_file() or device.is_dir():
-            raise ValueError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
-                             "/dev/input/js0, /dev/input/js1 …")
-        if name != "auto" and not device.exists():
-            return f"--joystick {name}: not connected yet, waiting for it"
-        return ""
 
     def world_parameters(self) -> Mapping[str, Any]:
         """Return the number of obstacles for the world."""

@@ -15,7 +15,6 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.detection.finding import Lasting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.application import TELEOPERATION
 from rampart.actors.osmosis.control.teleoperation.joystick_device import AUTO, JoystickDevice
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.messages import Joystick
@@ -161,7 +160,8 @@ class _WayOut:
 
 def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
     spec = systems.load(session.run.system_file)
-    parameters = next((n.parameters for n in spec.nodes if n.actor == TELEOPERATION), {})
+    actor = f"{Teleoperation.__module__}:{Teleoperation.__name__}"
+    parameters = next((n.parameters for n in spec.nodes if n.actor == actor), {})
     mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
                               "teleoperation")
     device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)

@@ -32,7 +32,7 @@ UP, LEFT = "\x1b[A", "\x1b[D"
 def run(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
     os.mkfifo(directory / "stick")
-    with RealRun(directory, "paper", "--joystick", str(directory / "stick")) as it:
+    with RealRun(directory, "paper") as it:
         it.wait_for("mission AB running", 60)
         yield it
 
@@ -137,15 +137,19 @@ def test_a_held_key_drives_and_without_its_repetition_or_its_process_the_robot_s
 
 
 def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
-    device = os.open(run.directory / "stick", os.O_WRONLY)
+    fifo = run.directory / "stick"
     with echo(run, "teleoperation/command") as heard, \
+            PseudoTerminal("joystick", "--port", str(run.port), "--device", str(fifo)) as driver, \
             PseudoTerminal("joystick", "--port", str(run.port)) as it:
         it.wait_for("hold a key")
+        driver.wait_for("hold the dead-man button")
+        device = os.open(fifo, os.O_WRONLY)
         os.write(device, EVENT.pack(0, 1, BUTTON, 4) + EVENT.pack(0, 16384, AXIS, 0))
         it.wait_for(lambda: len(heard()) > 5)
-        hold(it, UP, lambda: "stick has the stick" in it.text)
+        hold(it, UP, lambda: "has the stick" in it.text)
         assert all(linear == 0.0 and turn < 0.0 for linear, turn in map(twist, heard()))
         os.close(device)  # pulled out
+        driver.wait_for("the joystick vanished")
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
         it.press("q")
         assert it.end() == 0

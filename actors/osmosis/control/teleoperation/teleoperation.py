@@ -1,8 +1,8 @@
 """Teleoperation: converts the joystick to a velocity command.
 
 It is silent while the dead-man button is released, which ends the Safety Pilot's joystick mode. The
-joystick is a device of this machine, or a node that publishes `topics.JOYSTICK`;
-`stick_arbitration` selects one of several.
+operator's page and `rampart joystick` publish `topics.JOYSTICK`; `stick_arbitration` selects one of
+several sources.
 """
 
 from __future__ import annotations
@@ -13,21 +13,14 @@ import msgspec
 
 from rampart.actors.operator.stick_arbitration import Ruling, StickArbiter
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.teleoperation.joystick_device import (
-    JoystickDevice,
-    StickMapping,
-)
+from rampart.actors.osmosis.control.teleoperation.joystick_device import StickMapping
 from rampart.actors.osmosis.messages import Joystick, StickTwist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import NonNegative
 
 _LOOK_S = 0.05
-"""Period for repeating a held joystick and noticing a silent one (simulated seconds)."""
-
-_REPLUG_S = 0.5
-"""Period for opening a missing device."""
+"""Period for noticing a silent joystick (simulated seconds)."""
 
 
 def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
@@ -47,24 +40,18 @@ def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
 
 
 class Teleoperation(Actor):
-    """Converts each joystick position to a command at once.
-
-    A device reports only changes, so its position is repeated while the dead man is held; nodes
-    repeat their messages. A device that fails counts as released, and is opened again.
-    """
+    """Converts each joystick position to a command at once. Sources repeat a held position."""
 
     class Parameters(Actor.Parameters, StickMapping, frozen=True):
-        """Speeds and device, besides those of `StickMapping`.
+        """Speeds, besides the mapping of a device, which `rampart joystick --device` uses.
 
         Attributes:
             linear_mps: speed at full deflection; by default the robot's.
             angular_radps: turn rate at full deflection; by default the robot's.
-            device: path of a joystick, "auto" for the first one, "" for none.
         """
 
         linear_mps: NonNegative | None = None
         angular_radps: NonNegative | None = None
-        device: str = ""
 
     parameters: Parameters
     outputs = (topics.TELEOP_COMMAND,)
@@ -77,36 +64,22 @@ class Teleoperation(Actor):
             robot.top_turn_rate_radps if own.angular_radps is None else own.angular_radps)
         self._arbiter = StickArbiter(self.clock.now())
         self._look: Timer | None = None
-        self._named = Osmosis.of(context).options.joystick or own.device
-        self._device = JoystickDevice(self._named, own, self._moved, self._gone)
-        self._missing = ""
-
-    def on_start(self) -> None:
-        """Open the joystick, if one is configured."""
-        if self._named and not self.context.run.plan.virtual:
-            self._plug()
-
-    def on_stop(self) -> None:
-        """Close the joystick."""
-        self._device.close()
 
     @on(topics.JOYSTICK)
     def joystick(self, message: Joystick, header: Header) -> None:
         """Take a position; publish its velocity if it is selected."""
-        self._offer(header.source, message, header.stamp)
-
-    def _offer(self, source: str, stick: Joystick, stamp_s: float) -> None:
-        twist = stick_twist(stick, self._linear_mps, self._angular_radps)
-        ruling = self._arbiter.offer(source, twist is not None, stamp_s, self.clock.now())
+        twist = stick_twist(message, self._linear_mps, self._angular_radps)
+        ruling = self._arbiter.offer(
+            header.source, twist is not None, header.stamp, self.clock.now())
         if twist is not None and ruling.follows:
             self.publish(topics.TELEOP_COMMAND, msgspec.structs.replace(
-                twist, held_since_s=ruling.since_s), stamp=stamp_s)
+                twist, held_since_s=ruling.since_s), stamp=header.stamp)
         self._obey(ruling)
         self._attend()
 
     def _attend(self) -> None:
-        """Schedule `_again` while a joystick is held."""
-        if (self._device.stick.dead_man or self._arbiter.holder) and self._look is None:
+        """Look for silence while a joystick is held."""
+        if self._arbiter.holder and self._look is None:
             self._look = self.call_later(_LOOK_S, self._again)
 
     def _obey(self, ruling: Ruling) -> None:
@@ -117,32 +90,6 @@ class Teleoperation(Actor):
             self.report_diagnostic("joystick", ruling.told, ruling.whom)
 
     def _again(self) -> None:
-        """Repeat a held device, and release a silent joystick."""
         self._look = None
-        if self._device.stick.dead_man:
-            self._moved()
-        else:
-            self._obey(self._arbiter.expire(self.clock.now()))
+        self._obey(self._arbiter.expire(self.clock.now()))
         self._attend()
-
-    # -- the device -----------------------------------------------------------------------------
-
-    def _plug(self) -> None:
-        missing = self._device.open()
-        if missing and missing != self._missing:
-            self.report_diagnostic(
-                "joystick", f"waiting for the device: {missing}", self._device.path)
-        self._missing = missing
-        if missing:
-            self.call_later(_REPLUG_S, self._plug)
-        else:
-            self._moved()  # a button that is already down counts as released
-
-    def _moved(self) -> None:
-        self._offer(self._device.path, self._device.stick, self.clock.now())
-
-    def _gone(self, why: str) -> None:
-        self._moved()  # a closed device is released
-        self.report_diagnostic("joystick", f"lost: {why}", self._device.path)
-        self._missing = why
-        self.call_later(_REPLUG_S, self._plug)
