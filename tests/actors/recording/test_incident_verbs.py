@@ -132,9 +132,9 @@ def test_incidents_of_a_folder_that_cannot_be_written_are_still_readable(box, ca
 def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
         home, tmp_path, capsys):
     with RealRun(tmp_path, "osmosis", "--mission", "A", "--black-box") as run:
-        run.sleep_until(6.0)
+        run.sleep_until(3.0)
         run.kill("localization")
-        run.sleep_until(12.0)
+        run.sleep_until(7.0)
         box = pid_of("black-box", run.port)
         killed_s = (time.monotonic() - run.info.origin_s) * run.info.rate
         os.kill(box, signal.SIGKILL)
