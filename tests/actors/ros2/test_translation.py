@@ -12,12 +12,14 @@ import pytest
 
 from rampart.actors.bus.bounds import Floats32
 from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos
 from rampart.actors.ros2.translation.forms import READY, WRITTEN
 from rampart.actors.ros2.translation.mapping import (
     Inward,
     NotMeantError,
     Outward,
     message_of,
+    topic_of,
 )
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
@@ -154,6 +156,11 @@ def test_what_a_sensor_says_it_does_not_know_is_none_and_the_rest_passes(kind, f
     link = Ros2Link(type=kind, subscribe="/x", to="x")
     made, _ = Inward(link, JAZZY, message_of(link, JAZZY))(changed(kind, **fields))
     assert {name for name in made.__struct_fields__ if getattr(made, name) is None} == unknown
+
+
+def test_of_several_publishers_no_message_replaces_another_one_s():
+    link = Ros2Link(type="std_msgs/msg/Bool", subscribe="/x", to="x", publishers="any")
+    assert topic_of(link, JAZZY).qos is Qos.COMMAND
 
 
 @pytest.mark.parametrize("kind", sorted(READY))
