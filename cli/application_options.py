@@ -24,8 +24,7 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], chosen: Mappin
         chosen: values of the specification, for the help.
         crossed: the command makes many runs in virtual time, and takes several values of each.
     """
-    fields = [field for field in msgspec.structs.fields(kind.Options)
-              if not (crossed and _parts(kind, field.name)[1].get("real"))]
+    fields = msgspec.structs.fields(kind.Options)
     if not fields:
         return
     group = parser.add_argument_group(f"options of this system ({kind.__name__})")
@@ -35,14 +34,13 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], chosen: Mappin
         if crossed:
             default = extra.get("campaign", default)
         shown = "" if default in ("", msgspec.NODEFAULT) else f" (default: {default})"
-        more = {"nargs": "?", "const": extra["alone"]} if "alone" in extra else {}
         metavar = extra.get("metavar", field.name.upper())
         group.add_argument(
             f"--{field.name.replace('_', '-')}", dest=f"application_{field.name}",
             default=extra.get("campaign") if crossed else None,
             metavar=f"{metavar},..." if crossed else metavar,
             type=str if crossed else plain if plain in {int, float} else str,
-            help=extra.get("description", "") + shown, **more)
+            help=extra.get("description", "") + shown)
 
 
 def chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, Any]:

@@ -83,8 +83,6 @@ class Run:
                 raise UsageError("--virtual: expected --duration S, or an [end] with after_s in "
                                  f"{spec.name}: a run in virtual time has to end")
         application = load_application(plan, spec)
-        if note := application.check(spec, virtual=options.virtual):
-            _say(note)
         run = RunContext(plan, spec, load_document(plan), application)
         self._directory = Path(options.report) if options.report else (
             reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind(run).name}")

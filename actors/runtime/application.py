@@ -20,7 +20,6 @@ import msgspec
 
 from rampart.actors import ROLES
 from rampart.actors.bus.topic import Topic
-from rampart.manager.spec.schema import SystemSpec
 
 
 class Application:
@@ -49,8 +48,7 @@ class Application:
         """Options of a run; each field is an option of the command line, with its help.
 
         Keys in the `extra` of a field's `msgspec.Meta`: `metavar`; `file`: the value may be a path;
-        `alone`: value of an option that is given without one; `campaign`: default in a campaign,
-        values separated by commas; `real`: the option has no use in virtual time.
+        `campaign`: default in a campaign, values separated by commas.
         """
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
@@ -85,19 +83,6 @@ class Application:
         """
         del directory
         return Application()
-
-    def check(self, spec: SystemSpec, *, virtual: bool) -> str:
-        """Check the options; return a note for the user before the run starts, or "".
-
-        Args:
-            spec: the system.
-            virtual: whether time is virtual.
-
-        Raises:
-            ValueError: the options do not fit the system or the kind of run.
-        """
-        del spec, virtual
-        return ""
 
     @classmethod
     def said(cls, name: str, value: Any) -> str:
