@@ -107,11 +107,6 @@ class Osmosis(Application):
             return f"{value or 'no'} obstacle{'' if value == 1 else 's'}"
         return super().said(name, value)
 
-    @classmethod
-    def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return the options without obstacles, if they have some."""
-        return [{**options, "obstacles": 0}] if options.get("obstacles") else []
-
     def world_parameters(self) -> Mapping[str, Any]:
         """Return the number of obstacles for the world."""
         return {"obstacles": self.options.obstacles}

@@ -90,16 +90,6 @@ class Application:
         return f"{name} {value}"
 
     @classmethod
-    def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return simpler options, which a search tries to find a smaller counterexample.
-
-        Args:
-            options: options of an unsafe run.
-        """
-        del options
-        return []
-
-    @classmethod
     def of(cls, context: Any) -> Self:
         """Return the application of the run of an actor, by its `Context`.
 

@@ -29,8 +29,7 @@ _CHOICE = (
             "inject this fault, or all that match a pattern such as 'kill:*'; repeatable"),
     whole("--together", "K", "K faults in each run (default: 1); with --fault: every combination "
           "of K on different topics", 1),
-    word("--kinds", "K,...", "with --runs or --search: only these kinds of faults of --list"),
-    whole("--search", "N", "search the smallest safety margin in N runs"),
+    word("--kinds", "K,...", "with --runs: only these kinds of faults of --list"),
     word("--replay", "RUN", "repeat a run of --out by its key, with a report"),
     flag("--list", "list the faults of the system"))
 
@@ -41,8 +40,7 @@ _CONDITIONS = (
     word("--network", "NAME", f"network model: {', '.join(NETWORKS)} (default: measured)",
          "measured"),
     whole("--seed", "N", "first seed (default: 1)", 1),
-    whole("--seeds", "N", "number of seeds: with --fault, runs of each fault; with --search, seeds "
-          "among all runs (default: 1)"),
+    whole("--seeds", "N", "with --fault: runs of each fault, each with its seed (default: 1)"),
     number("--patience", "S", "simulated seconds without progress after which a run fails "
            f"(default: {PATIENCE_S:g})", PATIENCE_S),
     number("--duration", "S", "simulated seconds of a run of a system without a mission "
@@ -124,7 +122,6 @@ def run(options: argparse.Namespace) -> int:
       rampart campaign --fault 'gps-*@30+inf' --fault 'imu-*@30+inf' --together 2
       rampart campaign --list                        # the faults of the system
       rampart campaign --replay 3f2a --out DIR       # repeat one run of DIR
-      rampart campaign --search 200                  # search the smallest margin
       rampart campaign --paper                       # the paper's tables
       rampart campaign --paper --full                # its rows on the full system
 

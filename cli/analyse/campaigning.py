@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import math
-import os
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +11,6 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from tqdm import tqdm
 
 from rampart.actors.runtime.run_plan import RunPlan
@@ -30,7 +27,6 @@ from rampart.cli.output import (
     unknown,
     warn,
 )
-from rampart.cli.verbs import extra
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
@@ -44,7 +40,6 @@ from rampart.sim.campaign.job import (
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
-from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.statistics import (
     Rate,
     Row,
@@ -66,8 +61,6 @@ from rampart.sim.virtual.network import find_network
 _LOG_S = 60.0
 """Real seconds between two lines of progress if stderr is not a terminal."""
 
-_SHRUNK_AT_MOST = 3
-
 _SHOWN = 60
 """Rows, at most; the report has all."""
 
@@ -80,8 +73,6 @@ def campaign(options: argparse.Namespace) -> int:
     if options.replay:
         return _replay(options)
     _check(options)
-    if options.search is not None:
-        return _hunt(options, spec)
     name, chosen = _choose(options, spec)
     jobs = with_content(chosen)
     named: NamedCampaign | None = options.named[0] if options.named else None
@@ -114,14 +105,12 @@ def campaign(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     chosen = [*(named.flag for named in options.named), *(name for name, given in (
-        ("--runs", options.runs is not None), ("--fault", options.fault),
-        ("--search", options.search is not None)) if given)]
+        ("--runs", options.runs is not None), ("--fault", options.fault)) if given)]
     if len(chosen) != 1:
-        known = ", ".join([*options.flags, "--runs N", "--fault FAULT", "--search N"])
+        known = ", ".join([*options.flags, "--runs N", "--fault FAULT"])
         raise UsageError(f"expected one of {known}; given: {', '.join(chosen) or 'none'}")
     for name, value, least in (("--runs", options.runs, 1), ("--together", options.together, 1),
-                               ("--seeds", options.seeds, 1), ("--search", options.search, 1),
-                               ("--jobs", options.jobs, 0)):
+                               ("--seeds", options.seeds, 1), ("--jobs", options.jobs, 0)):
         if value is not None and value < least:
             raise UsageError(f"{name} {value}: must be {least} or more")
     if not options.patience > 0:
@@ -180,9 +169,9 @@ def _on_different_topics(faults: Sequence[PlannedFault], spec: SystemSpec) -> bo
     return len(hit) == len(set(hit))
 
 
-def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[float, float]:
+def _moments(spec: SystemSpec, job: Job) -> tuple[float, float]:
     """Return the interval from which moments of faults are drawn: within a run without faults."""
-    if found := trial_class(spec).moments(spec, searched=searched):
+    if found := trial_class(spec).moments:
         return found
     lasts_s = run_virtually(job).record.duration_s
     return round(min(2.0, 0.1 * lasts_s), 2), round(0.9 * lasts_s, 2)
@@ -372,72 +361,3 @@ def _rate(found: Rate) -> str:
 
 def _milliseconds(found: Spread | None) -> str:
     return "-" if found is None else f"{found.median * 1e3:.0f} ms, at most {found.most * 1e3:.0f}"
-
-
-# -- the optimiser's search for the smallest safety margin --------------------------------------
-
-
-def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
-    """Search among the faults of a system, and shrink and keep the counterexamples."""
-    if not trial_class(spec).margins:
-        raise UsageError(f"--search: {spec.name} has no judge that measures margins")
-    extra("search", "optuna")
-    bases = with_content(_base_jobs(options, spec))
-    space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
-                  _moments(spec, bases[0], searched=True), options.together)
-    directory = Path(options.out or "reports/campaign-search")
-    store = Store(directory)
-    unit = trial_class(spec).margin_unit
-    workers = options.jobs or os.cpu_count() or 1
-    with tqdm(total=options.search, unit="run", file=sys.stderr,
-              disable=None) as bar:  # no bar into a file
-
-        def run(jobs: Sequence[Job]) -> Sequence[RunResult]:
-            try:
-                execute(jobs, store, workers=workers)
-                made = {r.job.key: r.result for r in store.runs({job.key for job in jobs})}
-            except (StoreError, JobError) as error:
-                raise UsageError(f"{error}; the finished runs are in {directory}, and the same "
-                                 "command continues there") from None
-            return [made[job.key] for job in jobs]
-
-        smallest = math.inf
-
-        def seen(job: Job, result: RunResult) -> None:
-            nonlocal smallest
-            if margin(result) < smallest:
-                smallest = margin(result)
-                bar.write(f"{smallest:8.3f} {unit}  {job.key}  {job.text()}", file=sys.stderr)
-            bar.update()
-
-        made = search(space, options.search, run, seed=options.seed,
-                      seeds=options.seeds or 1, at_once=workers, seen=seen)
-    unsafe = [job for job, result in made if not result.safe]
-    store.close()
-    shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
-    if options.json:
-        print_json({"runs": len(made), "unsafe": len(unsafe), f"smallest_margin_{unit}": smallest,
-                    "counterexamples": [{"file": str(path) if path else None, "job": job}
-                                        for job, path in shrunk]})
-    else:
-        print_table(("margin", "run", "faults"), [
-            (f"{margin(result):.3f} {unit}", job.key, job.text()) for job, result in made[:10]])
-        say_text(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} {unit}")
-        for job, path in shrunk:
-            chosen = "".join(f"{name} {value}, " for name, value in job.options.items())
-            say(f"counterexample: {job.text()}, {chosen}seed {job.seed}: {path or 'not written'}")
-    return 1 if unsafe else 0
-
-
-def _shrunk(job: Job, directory: Path) -> tuple[Job, Path | None]:
-    """Return a job without the faults that do not matter, and its file, None if not written."""
-    small = shrink(job, tried=lambda tried, found: print(
-        f"shrinking {'to' if found else 'not to'} {tried.text()}", file=sys.stderr))
-    path = directory / "counterexamples" / f"{small.key}.toml"
-    try:
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(msgspec.toml.encode(small))
-    except OSError as error:
-        warn(f"{path}: {error.strerror}")
-        return small, None
-    return small, path

@@ -33,8 +33,7 @@ EXTRAS = {
     "foxglove": ("foxglove", "no `rampart live foxglove`"),
     "prometheus": ("prometheus_client", "no `rampart live metrics`"),
     "export": ("pyarrow", "no `rampart bag export --to parquet`"),
-    "video": ("imageio_ffmpeg", "no `rampart replay --video`"),
-    "search": ("optuna", "no `rampart campaign --search`")}
+    "video": ("imageio_ffmpeg", "no `rampart replay --video`")}
 """Extra → its module, and the consequence if it is not installed."""
 
 State = Literal["ok", "without", "missing"]

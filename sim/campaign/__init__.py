@@ -1,1 +1,1 @@
-"""Thousands of virtual runs: planned, run on all cores, kept, counted, shown, and searched."""
+"""Thousands of virtual runs: planned, run on all cores, kept, counted and shown."""

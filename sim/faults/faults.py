@@ -39,8 +39,6 @@ class Faults:
         titled: Those of `others` that the operator's page offers: name → kind and title.
         kinds: All kinds with their titles, in the order of tables.
         sizes: Sizes of errors that count before those of the fields.
-        intruder: A fault that a search may add, and the range of the number at its end; None for
-            none.
     """
 
     named: Mapping[str, Fault] = {}
@@ -51,7 +49,6 @@ class Faults:
                                 "reading": "nonsense readings", "process": "processes",
                                 "several": "several at once"}
     sizes: ClassVar[Sizes] = Sizes()
-    intruder: ClassVar[tuple[str, float, float] | None] = None
 
     def own(self, fault: str, injection: str, duration_s: float | None) -> object | None:
         """Return the action of a fault that does not disturb a topic; None for other names.

@@ -71,6 +71,8 @@ class Trial:
         draws: Whether the report has curves of all numbers of the robot.
         resumes: Whether a resumed run continues the record of the part before.
         pictures: Class path of the `RunPictures` in a campaign's report; "" for none.
+        moments: First and last simulated time at which a campaign injects faults; None if they
+            follow from the length of a run without faults.
 
     Args:
         run: Context of the run.
@@ -97,6 +99,7 @@ class Trial:
     draws: ClassVar[bool] = True
     resumes: ClassVar[bool] = True
     pictures: ClassVar[str] = ""
+    moments: ClassVar[tuple[float, float] | None] = None
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
@@ -279,15 +282,6 @@ class Trial:
         """Return the verdict on a run that is over."""
         return Verdict(success=record.mission == "success", safe=record.safety == "safe",
                        reasons=record.reasons)
-
-    @classmethod
-    def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float] | None:
-        """Return the first and last simulated time at which a campaign or a search injects faults.
-
-        None if they follow from the length of a run without faults.
-        """
-        del spec, searched
-        return None
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write the report, or as much of it as can be written."""

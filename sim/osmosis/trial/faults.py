@@ -245,7 +245,6 @@ class OsmosisFaults(Faults):
              "reading": "nonsense readings", "sensor": "sensors", "frozen": "frozen sets",
              "process": "processes", "actuator": "actuators", "world": "the world",
              "several": "several at once"}
-    intruder = (OBSTACLE, 1.2, 6.0)
 
     def own(self, fault: str, injection: str, duration_s: float | None
             ) -> tuple[Order, ...] | SuddenObstacle | None:

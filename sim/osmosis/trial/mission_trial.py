@@ -18,7 +18,6 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.actor import Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
-from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.injector import Injector, PlannedAction
 from rampart.sim.osmosis.trial.faults import SuddenObstacle
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
@@ -307,6 +306,7 @@ class MissionTrial(Trial):
     margins = {"obstacle_m": "nearest obstacle", "prohibited_m": "nearest prohibited area"}
     exact_below = EXACT_BELOW_M
     pictures = "rampart.sim.osmosis.trial.report:RunMaps"
+    moments = 2.0, 120.0
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
@@ -351,12 +351,6 @@ class MissionTrial(Trial):
         """Return the verdict by ground truth: clearances, and when it became unsafe."""
         del record
         return self.settled(self.recorder.judge.verdict())
-
-    @classmethod
-    def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float]:
-        """Return the range of moments within the shipped missions, longer for a search."""
-        del spec
-        return 2.0, 150.0 if searched else 120.0
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write the inspection report as far as possible."""

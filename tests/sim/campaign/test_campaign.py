@@ -27,7 +27,6 @@ from rampart.sim.campaign.content import with_content
 from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.statistics import (
     badness,
     rate,
@@ -337,57 +336,6 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
         assert [what_goes_wrong(j) for j in jobs] == [
             what_goes_wrong(j) for j in paper_jobs("B", seed=5) if condition_of(j) == condition]
     assert {j.system for j in full_jobs(system="other.toml")} == {"other.toml"}
-
-
-# ---- the search for the unsafe ---------------------------------------------------------------
-
-
-def test_the_search_goes_where_the_margin_is_small():
-    def fake(jobs):  # the nearer to 100 s and to gps-drift, the smaller the margin
-        return [result(margins={"obstacle_m": abs(j.faults[0].at_s - 100) / 100
-                                + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)})
-                for j in jobs]
-
-    pytest.importorskip("optuna")
-    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")})
-    made = search(space, 120, fake, seed=1, at_once=2)
-    assert len(made) == 120
-    assert [margin(r) for _, r in made] == sorted(margin(r) for _, r in made)
-    best = made[0][0].faults[0]
-    assert best.fault == "gps-drift"
-    assert abs(best.at_s - 100) < 10
-
-
-def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monkeypatch):
-    optuna = pytest.importorskip("optuna")
-    told = []
-    monkeypatch.setattr(optuna.Study, "tell",
-                        lambda _self, _trial, value=None, **_: told.append(value))
-    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
-    results = iter([result(outcomes=nothing),
-                    result(outcomes=nothing, safe=False, severity=1.0)])
-    search(Space(tuple(BASES), {"sensor": ("gps-bias",)}), 2,
-           lambda _jobs: [next(results)], seed=1)
-    assert told == [None, -1.0]
-
-
-def test_a_counterexample_is_shrunk_to_what_it_needs():
-    needed = PlannedFault("laser-stuck", 37.42, duration_s=31.7, on_s=1.0, off_s=0.5, seed=77)
-    job = Job(row="x", options={"obstacles": 2}, seed=99, faults=(
-        PlannedFault("gps-bias", 12.0), needed, PlannedFault("kill:DM3", 50.0)))
-
-    def run(candidate: Job) -> RunResult:
-        bad = any(f.fault == "laser-stuck" and (f.duration_s or 0) >= 5 and f.at_s > 30
-                  for f in candidate.faults)
-        return result(safe=not bad)
-
-    small = shrink(job, run)
-    assert (len(small.faults), small.options, small.seed) == (1, {"obstacles": 0}, 1)
-    fault, = small.faults
-    assert (fault.fault, fault.at_s, fault.on_s, fault.seed) == ("laser-stuck", 40.0, 0.0, 0)
-    assert 5 <= fault.duration_s < 10
-    with pytest.raises(ValueError, match="is safe, so it cannot be shrunk"):
-        shrink(job, lambda _job: result())
 
 
 # ---- the verb --------------------------------------------------------------------------------
