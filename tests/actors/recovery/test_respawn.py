@@ -125,6 +125,16 @@ def test_a_node_counts_as_back_when_its_new_life_is_heard(events, end):
         end == "back", end == "pending", end == "failed")
 
 
+def test_a_heartbeat_sent_before_the_order_proves_nothing_one_sent_after_it_does():
+    rm = core()
+    seen(rm, incarnation=3)
+    rm.order(["a"], 1.05, renewed=False)  # its death is not known here yet
+    rm.beat("a", 3, 1.04, 1.06)
+    assert rm.pending == ("a",)
+    rm.beat("a", 3, 1.14, 1.15)  # it was continued just in time
+    assert rm.back == ("a",)
+
+
 @pytest.mark.parametrize("dies", [True, False])
 def test_a_new_life_that_dies_or_is_not_heard_is_asked_for_again(dies):
     rm = core()

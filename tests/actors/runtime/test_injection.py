@@ -18,6 +18,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import (
     Goal,
+    Imu,
     LaserScan,
     MissionRequest,
     Mode,
@@ -106,6 +107,24 @@ def test_an_intermittent_fault_comes_and_goes_from_the_moment_of_injection(on_s,
     assert faults.expire("i") == expected.count("x")
 
 
+def test_an_intermittent_freeze_repeats_what_was_healthy_last():
+    faults = gate("freeze", on_s=2.0, off_s=2.0)
+    sent(faults, [9.0])
+    out = sent(faults, [10.0, 11.0, 12.0, 13.0, 14.0, 15.0])
+    assert [(x, stamp) for x, stamp, *_ in out] == [
+        (9.0, 9.0), (9.0, 9.0), (12.0, 12.0), (13.0, 13.0), (13.0, 13.0), (13.0, 13.0)]
+
+
+def test_faults_on_one_topic_act_in_the_order_in_which_they_were_ordered():
+    faults = FaultGate()
+    for name, mode, fields in (("a", "corrupt", {"set_fields": {"x_m": 4.0}}),
+                               ("b", "corrupt", {"add_fields": {"x_m": 1.0}}),
+                               ("c", "duplicate", {}), ("d", "delay", {"delay_s": 0.2})):
+        assert faults.order(Injection(name, "localization/pose", mode, 5.0, **fields), 10.0) == ""
+    out = faults.apply(KEY, POSE, 10.0, 10.0)
+    assert (out.body.x_m, out.copies, out.delay_s) == (5.0, 2, 0.2)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
 def test_a_share_of_the_messages_is_affected(share):
     count = 4000
@@ -155,6 +174,7 @@ def test_a_route_keeps_its_ends_and_moves_as_a_whole():
     (MissionRequest("m", "", (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))),
      {"add_fields": {"goals.x_m": 10.0}},
      MissionRequest("m", "", (Goal(11.0, 2.0, Mode.TAXI), Goal(13.0, 4.0, Mode.TAXI)))),
+    (Imu(3.0, 0.0, 0.0, 0.0), {"add_fields": {"yaw_rad": 1.0}}, Imu(wrap(4.0), 0.0, 0.0, 0.0)),
     (Route("m", 0, Mode.TAXI, True, (), ""),
      {"set_fields": {"mode": "light verification", "active": False}},
      Route("m", 0, Mode.LIGHT_VERIFICATION, False, (), "")),
