@@ -176,6 +176,16 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
             for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
 
 
+@within(whole)
+async def test_a_detection_module_whose_reports_are_old_news_is_silent(system):
+    system.supervisor.answer = "nothing"
+    system.inject(ftm_topics.DETECTION, "freeze", 60.0, member="DM3")
+    await asyncio.sleep(0.5)
+    assert system.status.silent == ()
+    await asyncio.sleep(1.0)
+    assert system.status.silent == ("DM3",)
+
+
 @pytest.mark.parametrize("dies_too", [(), ("RM1",)], ids=["alone", "with RM1"])
 @within(whole)
 async def test_a_respawned_manager_adopts_a_latched_emergency_stop(system, dies_too):

@@ -77,6 +77,12 @@ def test_the_round_is_made_in_spite_of_a_fault(fault, mechanism, recovery):
     assert recovery in done.record.decisions[0].recoveries
 
 
+def test_without_a_fault_the_round_is_made_without_a_decision():
+    done = virtual_run(SYSTEM)
+    assert (done.judgement.safe, done.judgement.success) == (True, True)
+    assert (done.failures, done.record.decisions) == ((), ())
+
+
 def test_a_command_that_is_stuck_ends_before_the_next_obstacle_and_the_round_is_made():
     done = virtual_run(SYSTEM, "stuck:nav/command@28.24+inf")
     assert (done.judgement.safe, done.judgement.success) == (True, True)

@@ -275,6 +275,24 @@ async def test_a_stopped_reader_delays_no_other_reader(routers, sockets):
         assert max(later - earlier for earlier, later in pairwise(heard)) < 1.0
 
 
+async def test_a_newcomer_is_answered_after_all_routers_were_replaced(routers, sockets):
+    await routers.start(*ROUTERS)
+    async with client(sockets, "node") as writer:
+        writer.publish(topics.GOAL, topics.GOAL.at(), b"long ago")
+        for name in ROUTERS:
+            routers.send(name, signal.SIGKILL)
+            await asyncio.sleep(0.1)
+            await routers.start(name)
+        async with client(sockets) as reader:
+            answers: list[list[bytes]] = []
+
+            def asked() -> bool:
+                answers.append(ask(reader))
+                return [b"long ago"] in answers
+
+            await eventually(asked, 5)
+
+
 async def test_a_flood_of_questions_is_answered_in_part(routers, sockets):
     await routers.start("router_a")
     async with client(sockets, "node") as writer, client(sockets) as reader:

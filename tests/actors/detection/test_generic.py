@@ -144,6 +144,21 @@ def test_after_steps_that_could_not_be_heard_any_step_may_be_the_next():
     assert monitor.active, "only the first one after it is believed"
 
 
+def test_a_rate_that_was_too_high_is_in_order_again_after_a_while_of_silence():
+    monitor = RateMonitor(0.0, 8.0, 0.3, 0.0, 0.5, clear_s=0.4)
+    found = play(monitor, lambda _event, now_s: monitor.heard(now_s), "mmmm" + "." * 8)
+    assert found == "--AAAAAA----"
+
+
+def test_a_step_is_not_busy_for_longer_than_it_may_be():
+    monitor = ProgressMonitor("task", STEPS, busy_at_most_s=0.2)
+    monitor.heard("1", 0.0)
+    monitor.busy(1e6)
+    assert monitor.due_s == pytest.approx(0.6)
+    monitor.busy(math.nan)
+    assert monitor.due_s == pytest.approx(0.4)
+
+
 # a, b, c ...: a value, A: the same as a, of a new process; x may last. The same for 300 ms is too
 # long; it then has to go on changing for 200 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
@@ -206,7 +221,7 @@ def reports(kind: Callable[[Context], Actor], script: list[tuple[Any, ...]], unt
             respawned: bool = False, **parameters: Any) -> list[tuple[float, str, str]]:
     """Return when a module changed its state, that, and why.
 
-    The script is what is said: time, topic, message and, if it is not the gauge, by whom.
+    The script is what is said: time, topic, message and, if it is not the gauge, by whom, and when.
     """
 
     async def scenario() -> list[tuple[float, str, str]]:
@@ -214,9 +229,11 @@ def reports(kind: Callable[[Context], Actor], script: list[tuple[Any, ...]], unt
             ear = system.start("ear", Ear)
             system.incarnations["D"] = 1 if respawned else 0
             system.start("D", kind, **parameters)
-            for at_s, topic, message, *source in script:
+            for row in script:
+                at_s, topic, message, source, stamp_s = row if len(row) == 5 else (
+                    *row, "gauge", None)
                 await asyncio.sleep(max(0.0, at_s - system.clock.now()))
-                system.say(topic, message, *(source or ["gauge"]))
+                system.say(topic, message, source, stamp_s=stamp_s)
             await asyncio.sleep(until_s - system.clock.now())
             found: list[tuple[float, str, str]] = []
             for at_s, report in ear.heard:
@@ -431,7 +448,7 @@ def lost(*hosts: str) -> fm.NodeTable:
 ])
 def test_who_is_lost_is_told_after_the_time_that_was_said(parameters, hosts, reason):
     tables = (lost(), lost(*hosts), lost(*hosts), lost(), lost())
-    script = [(0.4 * i, topics.NODES, one, "supervisor") for i, one in enumerate(tables)]
+    script = [(0.4 * i, topics.NODES, one, "supervisor", None) for i, one in enumerate(tables)]
     found = reports(LinkLost, script, 1.7, **parameters)
     assert [(state, why) for _, state, why in found] == [
         ("idle", ""), ("active", reason), ("idle", "")][:3 if reason else 1]
@@ -444,7 +461,8 @@ NODES = ("a", "b", "c", "d", "e", "f")
 
 
 def overloaded(script: list[tuple[float, Collection[str], float]], until_s: float = 6.0,
-               waits_until_s: float = 0.0, **options: bool) -> list[tuple[float, str]]:
+               waits_until_s: float = 0.0, under_way_s: float = 0.0, **options: bool
+               ) -> list[tuple[float, str]]:
     """When DM14 changed its state: heartbeats at a time, from nodes, that were so late.
 
     Until `waits_until_s` their processes wait for a processor for a fifth of the time.
@@ -453,7 +471,8 @@ def overloaded(script: list[tuple[float, Collection[str], float]], until_s: floa
         return Overload(replace(context, scheduled=lambda _pid: Usage(
             "S", 1.0, 0.2 * min(context.clock.now(), waits_until_s))))
 
-    beats = [(at_s, bus_topics.HEARTBEAT, bm.Heartbeat(ord(node), 1, 0.1, 0, 0, late_s), node)
+    beats = [(at_s, bus_topics.HEARTBEAT, bm.Heartbeat(ord(node), 1, 0.1, 0, 0, late_s), node,
+              at_s - under_way_s)
              for at_s, nodes, late_s in script for node in nodes]
     found = reports(module, beats, until_s, **options, watch=list(NODES), late_s=0.15, clear_s=1.0,
                     wait_s=4.0)
@@ -478,6 +497,11 @@ def test_one_that_was_late_for_long_counts_for_as_long():
     """A loop that turns every 0.9 s reports every 0.9 s; another one reports in between."""
     script = [(1.0 + 0.45 * i, "ab"[i % 2], 0.9) for i in range(8)]
     assert [state for _, state in overloaded(script, 4.0)] == ["idle", "active"]
+
+
+def test_what_is_long_under_way_is_late_as_well():
+    script = [(1.0 + 0.1 * i, "abcd", 0.0) for i in range(5)]
+    assert [s for _, s in overloaded(script, 1.5, under_way_s=0.4)] == ["idle", "active"]
 
 
 @pytest.mark.parametrize(("waits_until_s", "idle_s"), [(0.0, 2.5), (3.2, 4.7), (99.0, 6.5)])

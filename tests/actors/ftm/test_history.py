@@ -43,6 +43,8 @@ def test_a_detection_is_suspected_a_decision_confirms_it_and_time_heals_it():
     detection(debounce, 1.0, "pump#1")
     assert states(debounce, 1.0) == [("DM7", "pump", "suspected", 1)]
     detection(debounce, 1.2, "pump#2")  # repeated, of its successor
+    decision(debounce, 1.25)  # without a fault: confirms nothing
+    assert states(debounce, 1.25) == []
     decision(debounce, 1.3, "FTM7")
     assert states(debounce, 1.3) == [("DM7", "pump", "confirmed", 0)]
     detection(debounce, 2.0, active=False)

@@ -472,6 +472,16 @@ def test_a_state_with_which_processes_fail_soon_is_given_up():
     assert Desk(MemoryCheckpoints(shelf, 10)).count() == 14  # and the count of failures is over
 
 
+def test_a_state_of_its_own_with_which_a_process_fails_soon_counts_as_well():
+    shelf: list[Record] = []
+    for incarnation in range(1, 1 + FAILED_IN_A_ROW):
+        desk = Desk(MemoryCheckpoints(shelf, incarnation))
+        desk.count()
+        desk.keep(13)
+        desk.keeper.failed()
+    assert Desk(MemoryCheckpoints(shelf, 9)).count() is None
+
+
 def test_processes_that_fail_late_or_are_killed_do_not_count_against_the_state():
     shelf: list[Record] = []
     Desk(MemoryCheckpoints(shelf, 1)).keep(13)

@@ -108,6 +108,7 @@ def test_an_intermittent_fault_comes_and_goes_from_the_moment_of_injection(on_s,
 
 
 def test_an_intermittent_freeze_repeats_what_was_healthy_last():
+    assert [x for x, *_ in sent(gate("stuck"), [10.0, 11.0])] == [10.0, 10.0]  # or what came first
     faults = gate("freeze", on_s=2.0, off_s=2.0)
     sent(faults, [9.0])
     out = sent(faults, [10.0, 11.0, 12.0, 13.0, 14.0, 15.0])
@@ -205,6 +206,12 @@ def test_an_array_is_filled_ramped_and_biased_element_by_element(values, fill, r
         after = gate("corrupt", **fields).apply(KEY, before, 0.0, 10.0 + elapsed_s).body
         assert ranges(after).tolist() == expected.astype("<f4").tolist()
         assert after.range_max_m == before.range_max_m
+
+
+def test_the_noise_of_an_array_differs_from_element_to_element():
+    after = ranges(corrupted(scan([4.0] * 2000), noise_fields={"ranges_f32": 0.3}, seed=1))
+    assert len(set(after.tolist())) > 1900
+    assert np.std(after) == pytest.approx(0.3, rel=0.08)
 
 
 @given(st.floats())

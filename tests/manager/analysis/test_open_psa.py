@@ -49,6 +49,13 @@ def test_a_count_a_constant_and_an_event_without_its_kind_have_their_meaning(bod
     assert cut_sets(mef(gate("top", body))) == expected
 
 
+def test_house_events_are_constants_wherever_they_are_defined():
+    text = mef(gate("top", '<and><house-event name="h"/><basic-event name="a"/></and>'),
+               data='<model-data><define-house-event name="h"><constant value="true"/>'
+                    "</define-house-event></model-data>")
+    assert cut_sets(text) == sets("a")
+
+
 def test_private_names_of_components_do_not_meet():
     inner = gate("g", f"<or>{events('e')}</or>", ' role="private"') + \
         '<define-basic-event name="e" role="private"/>'

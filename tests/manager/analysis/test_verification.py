@@ -50,6 +50,8 @@ def test_every_property_is_checked_for_every_strategy(report):
         assert found.cases >= 6
         assert found.holds == (found.count == 0) == (not found.counterexamples)
         assert len(found.counterexamples) == min(found.count, 3)
+        sizes = [trace[0].split(" active")[0].count("FTM") for trace in found.counterexamples]
+        assert sizes == sorted(sizes), "the shortest first"
 
 
 def test_exactly_these_properties_fail_on_the_papers_system(report):

@@ -424,6 +424,21 @@ def test_a_number_that_was_never_given_is_not_counted_on_from():
     assert bench.state.number < 100
 
 
+def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
+    spec = edited(RM2={"latched": True})
+    bench = Bench(spec)
+    bench.active("DM2")
+    bench.report("RM2", DONE)
+    bench.active("DM1")
+    assert bench.orders == "RM1"
+    memory = remember(bench.state, bench.arbiter)
+    assert {latch.command.recovery for latch in memory.latches} == {"RM1", "RM2"}
+    assert objection(memory) == ""
+    state = recall(bench.arbiter, memory, 100.0, 0)
+    assert set(state.latched) == {"RM1", "RM2"}
+    assert [t.wanted for t in state.recoveries[:2]] == [True, False]
+
+
 def differences(outputs) -> list[ShadowDiffered]:
     return [o for o in outputs if isinstance(o, ShadowDiffered)]
 
@@ -440,6 +455,17 @@ def test_a_shadow_tells_where_it_would_have_run_something_else():
     bench.wait(5.0)
     assert len(differences(bench.log)) == 1  # once a decision
     assert bench.orders == "RM2"  # it does nothing itself
+
+
+def test_a_patient_shadow_is_told_who_is_late():
+    """Nothing new is decided, but the shadow would have climbed to RM2."""
+    bench = Bench(edited(shadow="mission-first", RM3={"deadline_s": 60.0}))
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", ACTING)
+    assert differences(bench.log) == []
+    (differed,) = differences(bench.wait(5.0))
+    assert (differed.taken, differed.decision.recoveries) == (("RM3",), ("RM2",))
+    assert bench.orders == "RM3"
 
 
 # ---- the short way through the inputs of a system in which nothing is wrong

@@ -19,14 +19,14 @@ from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
 from rampart.manager.analysis.verification import verify
 from rampart.manager.arbitration.arbiter import Arbiter
-from rampart.manager.arbitration.arbiter_memory import Memory, objection
+from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.clearing import clearing_in_words, reset_role
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
 from rampart.testing import VirtualSystem, run
-from tests.manager.bench import PAPER, Bench, edited, full_system
+from tests.manager.bench import PAPER, RMS, Bench, edited, full_system
 from tests.osmosis_system import run_context
 
 
@@ -87,6 +87,17 @@ def test_a_reset_that_is_older_than_the_latch_has_no_effect(number):
     assert (answer.granted, answer.reason) == (False, "the reset is older than the latch")
     run.play(f"latched: {rm}")
     assert not run.send(ResetAsked(rm, "now", run.now))[0].activate
+
+
+def test_a_manager_that_is_started_again_knows_since_when_the_error_is_gone():
+    run = bench(clear_after_s=5.0).play(STOPPED)
+    later = bench(clear_after_s=5.0)
+    later.now = run.now
+    later.state = recall(later.arbiter, remember(run.state, run.arbiter), run.now, 10_000)
+    later.play("wait 0.1 = RM2; active: FTM2")  # though RM2 died too, and the error is gone
+    for rm in RMS:
+        later.play(f"{rm} {'done' if rm == 'RM2' else 'idle'}")
+    later.play("wait 2 = RM2; refused RM2; wait 3; wait 0.1 =")
 
 
 def test_a_memory_with_an_impossible_time_is_refused():

@@ -84,6 +84,11 @@ def test_one_is_overdue_only_if_all_others_are_in_time(ages_s, found):
     assert (which.name if which else None) == found
 
 
+def test_one_that_was_never_heard_or_counts_as_silent_is_not_overdue():
+    assert overdue((DetectionTrack("DM", heard_s=0.0),), RULES, 10.0) is None
+    assert overdue((heard("DM", 9.0, silent=True),), RULES, 10.0) is None
+
+
 @given(st.lists(st.tuples(st.integers(1, 30), st.integers(1, 30)), min_size=1, max_size=20))
 def test_however_it_flaps_it_is_released_within_the_bound(flaps):
     """No starvation: idle for `release_hold_max_s`, it is believed."""
