@@ -38,6 +38,7 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, capsys
              f'name = "ros_router"\nparameters = {{ listen = "{where}" }}\n')):
         assert text.count(old) == 1
         text = text.replace(old, new)
+    (tmp_path / "ros.toml").write_text(text)
     victims = ("gateway", "ros_router", "osmosis_control", "gateway", "localization", "hmi",
                "ros_router", "safety_pilot", "ftm_manager")
     with RealRun(tmp_path, tmp_path / "ros.toml", "--mission", str(write_row_mission(tmp_path)),

@@ -86,7 +86,7 @@ def test_a_certificate_says_who_where_and_for_how_long(keys):
     found = certificate(keys, "DM4")
     assert (found.common_name, found.kind, found.is_ours, found.has_key, found.addresses) == (
         "DM4", "node", True, True, ())
-    assert found.not_before < NOW
+    assert found.not_before < dt.datetime.now(dt.UTC)
     assert found.not_after - found.not_before < dt.timedelta(days=2, minutes=6)
     issue(keys, ["ada"], "operator")
     issue(keys, ["DM5"], "node")

@@ -247,7 +247,7 @@ class Hosts:
 
     def __init__(self, keys):
         self.keys = keys
-        self.kept = reserve_ports(9_100)
+        self.kept = reserve_ports(9_000)  # next to those of `keyed`
         self.at = {name: f"tls/127.0.0.1:{kept.getsockname()[1]}"
                    for name, kept in zip(("router_a", "router_a_ground"), self.kept, strict=True)}
 
