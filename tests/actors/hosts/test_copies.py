@@ -1,6 +1,14 @@
-"""Two hosts hold the newest states of shared nodes, whatever the link does."""
+"""Two hosts hold the newest states of shared nodes, in messages and files, whatever the link does."""
 
 from __future__ import annotations
+
+import errno
+import queue
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -10,8 +18,12 @@ from hypothesis import strategies as st
 from rampart.actors.bus.bounds import MANY, MAX_PAYLOAD_BYTES
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState
+from rampart.actors.hosts import state_files
 from rampart.actors.hosts.copies import Copies, Received
+from rampart.actors.hosts.state_files import LOOK_S, StateFiles
 from rampart.actors.runtime.checkpoint import Record
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints, read
+from rampart.testing import wait_until
 
 HOMES = {"camera": "ground", "hmi": "ground", "drill": "moon"}
 EPOCH = 1_000_000
@@ -216,3 +228,118 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
     for node, age in newest.items():
         assert age is None or robot.disk[node].age == ground.disk[node].age == age
     assert not robot.problems and not ground.problems  # noqa: PT018
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "checkpoints"
+
+
+@contextmanager
+def store(folder: Path, incarnation: int = 1) -> Iterator[FileCheckpoints]:
+    made = FileCheckpoints(folder, "camera", "r", incarnation)
+    made.load()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+class Watched:
+    """The files of a camera, and the reports about them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.reported: queue.SimpleQueue = queue.SimpleQueue()
+        self.problems: list[tuple[str, str]] = []
+        self.files = StateFiles(
+            folder, "r", ["camera"],
+            lambda *what: self.reported.put(what), lambda *what: self.problems.append(what))
+
+    def next(self):
+        return self.reported.get(timeout=10)
+
+
+@pytest.fixture
+def watched(folder):
+    made = Watched(folder)
+    made.files.start()
+    yield made
+    made.files.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "states of nodes"]
+
+
+def test_the_last_of_many_is_always_seen_and_no_save_is_disturbed(folder, watched):
+    """Also when it comes in the moment in which the one before is read."""
+    with store(folder) as made:
+        made.save(1, 0, b"first")
+        assert watched.next() == ("camera", state(1, 1, b"first"), False)
+        for number in range(2, 400):
+            made.save(1, 0, b"%d" % number * 500)
+            if number % 20 == 0:
+                time.sleep(LOOK_S * (number % 3))
+        wait_until(lambda: watched.next()[1].generation == 399, 10, "it was not seen")
+        assert made.trouble() == ""
+    assert watched.problems == []
+
+
+def test_what_is_sent_is_kept_and_told_as_kept_and_nothing_older_is(folder, watched):
+    watched.files.settle("camera")
+    assert watched.next() == ("camera", None, True)
+    watched.files.take("camera", state(1, 3))
+    assert watched.next() == ("camera", state(1, 3), False)
+    watched.files.take("camera", state(1, 2))
+    watched.files.take("camera", state(1, 4))
+    assert watched.next() == ("camera", state(1, 4), False)
+    watched.files.take("camera", state(EPOCH + 1, 5))
+    assert watched.next() == ("camera", state(EPOCH + 1, 5), False)
+    watched.files.take("camera", state(1, 500))
+    watched.files.settle("camera")
+    assert watched.next() == ("camera", state(EPOCH + 1, 5), True)
+    assert watched.problems == []
+    with store(folder, 2 * EPOCH) as made:  # the process that replaces the lost one
+        made.save(1, 0, b"own")
+    assert read(folder, "camera", "r").records[:2] == (
+        state(2 * EPOCH, 6, b"own"), state(EPOCH + 1, 5))
+
+
+def test_a_damaged_file_is_told_once_and_what_comes_after_it_is_seen(folder, watched):
+    folder.mkdir()
+    (folder / "camera.1.1").write_bytes(b"no state" * 999)
+    wait_until(lambda: watched.problems, 10, "it was not reported")
+    time.sleep(5 * LOOK_S)
+    [(node, problem)] = watched.problems
+    assert node == "camera"
+    assert "cannot be read for another host" in problem
+    with store(folder, 2) as made:
+        made.save(1, 0, b"anew")
+        assert watched.next() == ("camera", state(2, 1, b"anew"), False)
+
+
+def test_a_state_that_cannot_be_read_in_one_moment_is_read_in_the_next(folder, monkeypatch):
+    with store(folder) as made:
+        made.save(1, 0, b"kept")
+    looks = []
+
+    def failing(*what):
+        looks.append(what)
+        if len(looks) < 4:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return read(*what)
+
+    monkeypatch.setattr(state_files, "read", failing)
+    made = Watched(folder)
+    made.files.start()
+    assert made.next() == ("camera", state(1, 1, b"kept"), False)
+    made.files.close()
+    [(_, problem)] = made.problems
+    assert "Too many open files" in problem
+
+
+def test_a_place_that_cannot_be_written_is_told(folder):
+    folder.write_text("a file, not a folder")
+    made = Watched(folder)
+    made.files.start()
+    made.files.take("camera", state(1, 3))
+    wait_until(lambda: any("a state of another host is not kept" in problem
+                           for _, problem in made.problems), 10, "it was not reported")
+    made.files.close()

@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import json
 import os
+import sys
+import tomllib
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
@@ -42,7 +45,7 @@ from rampart.actors.supervision.supervised_process import (
     State,
     SupervisedProcess,
 )
-from rampart.actors.system.layout import Layout, Unit
+from rampart.actors.system.layout import Layout, Unit, adapted_system
 from rampart.manager.actor import FtmManager
 from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.manager.spec.nodes import Kind, NodeSpec, RestartLimits
@@ -51,6 +54,7 @@ from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
 from rampart.testing import VirtualSystem, eventually, turns
 from tests import ROOT
+from tests.two_hosts import two_hosts
 from tests.virtual_time import within
 from tests.whole.missions import write_short_mission
 
@@ -821,3 +825,55 @@ def test_each_node_has_to_be_heard_and_the_manager_s_status_unless_it_could_not_
     assert silence(one, 10.0) == excused
     one.take(8, 3)
     assert silence(one, 10.0) == "", "another process"
+
+
+
+
+LAYOUT = Layout(PLAN, load_system(PLAN))
+
+
+@pytest.fixture
+def document():
+    return tomllib.loads((ROOT / "systems" / "paper.toml").read_text())
+
+
+def change(document, layout=LAYOUT) -> Layout:
+    adapted = AdaptedSystem(1, "a change", "me", json.dumps(document))
+    return adapted_system(layout, RunContext(), adapted)[0]
+
+
+@pytest.mark.parametrize("table", ["node", "detection", "recovery"])
+def test_a_module_that_was_not_there_at_the_start_is_never_imported(
+        document, table, tmp_path, monkeypatch):
+    document["strategy"] = "guarded-repair"
+    assert change(document).spec.strategy == "guarded-repair"
+    (tmp_path / "intruder.py").write_text("class Node: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    document[table][0]["actor"] = "intruder:Node"
+    with pytest.raises(ValueError, match="expected a class in a module that the running"):
+        change(document)
+    assert "intruder" not in sys.modules
+
+
+def left_out(document):
+    document["node"] = [row for row in document["node"] if row["name"] != "teleoperation"]
+
+
+@pytest.mark.parametrize(("edit", "words"), [
+    (lambda document: document["detection"][0].update(process="another"), "DM1: process = 'anot"),
+    (lambda document: document["detection"][0].update(process="DM2"), "DM1: process = 'DM2'"),
+    (left_out, "teleoperation")])
+def test_other_processes_than_those_that_run_are_refused(document, edit, words):
+    edit(document)
+    with pytest.raises(ValueError, match=words):
+        change(document)
+
+
+def test_a_host_to_which_a_module_would_have_to_move_is_refused(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"}))
+    document = tomllib.loads(file.read_text())
+    next(row for row in document["detection"] if row["name"] == "DM13")["host"] = "robot"
+    plan = RunPlan(system_file=str(file))
+    with pytest.raises(ValueError, match=r"^DM13: host = 'robot'"):
+        change(document, Layout(plan, load_system(plan)))
