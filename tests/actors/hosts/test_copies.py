@@ -1,4 +1,4 @@
-"""Two hosts hold the newest states of shared nodes, in messages and files, whatever the link does."""
+"""Two hosts hold the newest states of shared nodes, in messages and files, whatever happens."""
 
 from __future__ import annotations
 
