@@ -27,7 +27,7 @@ def test_a_mission_in_virtual_time_survives_the_gateway(tmp_path, capsys):
 @pytest.mark.processes
 @pytest.mark.alone
 @pytest.mark.timeout(500)
-def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, capsys):
+def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path):
     where = f"tcp/127.0.0.1:{free_port()}"
     text = SYSTEM.read_text(encoding="utf-8")
     for old, new in (
@@ -41,8 +41,8 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, capsys
     (tmp_path / "ros.toml").write_text(text)
     victims = ("gateway", "ros_router", "osmosis_control", "gateway", "localization", "hmi",
                "ros_router", "safety_pilot", "ftm_manager")
-    with RealRun(tmp_path, tmp_path / "ros.toml", "--mission", str(write_row_mission(tmp_path)),
-                 "--record", str(tmp_path / "run.mcap")) as run:
+    with RealRun(tmp_path, tmp_path / "ros.toml", "--mission",
+                 str(write_row_mission(tmp_path))) as run:
         run.wait_for("goal 1/")
         for number, victim in enumerate(victims, 1):
             run.sleep_until(3.0 * number)
@@ -51,10 +51,3 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, capsys
     assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
     assert code == 0
     assert {"gateway": 2, "ros_router": 2}.items() <= result["restarts"].items()
-    capsys.readouterr()
-    assert main(["bag", "ros2", str(tmp_path / "run.mcap"), str(tmp_path / "bag"), "--json",
-                 "--system", str(tmp_path / "ros.toml")]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert {"/odom", "/imu", "/scan", "/fix", "/cmd_vel", "/rampart/decision",
-            "/rampart/localization/pose", "/tf"} <= set(told["messages"])
-    assert told["messages"]["/odom"] > 500
