@@ -35,91 +35,90 @@ _LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "p
 EXIT_OVER, EXIT_FAILED = 0, 1
 
 
-class HostRun:
-    """The part of one host in a run.
+def plan_of_host(options: argparse.Namespace, plan: RunPlan, directory: Path) -> RunPlan:
+    """Return the part of the plan that this host chooses.
 
     Args:
         options: options of the command line.
-        plan: the part of the plan that this host chooses.
+        plan: the plan that they make.
         directory: directory of checkpoints and tracebacks.
 
     Raises:
         UsageError: the first host chooses one of the given options.
     """
+    why = f"on host {plan.host}, the command line of the first host decides this"
+    refuse(options, _LEFT_TO_THE_FIRST, why)
+    for name, value in plan.options.items():
+        raise UsageError(f"--{name.replace('_', '-')} {value}: {why}")
+    kept = directory.resolve()
+    return msgspec.structs.replace(
+        plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
+        page=audited(plan.page, kept / f"audit-{plan.host}.jsonl"))
 
-    def __init__(self, options: argparse.Namespace, plan: RunPlan, directory: Path) -> None:
-        why = f"on host {plan.host}, the command line of the first host decides this"
-        refuse(options, _LEFT_TO_THE_FIRST, why)
-        for name, value in plan.options.items():
-            raise UsageError(f"--{name.replace('_', '-')} {value}: {why}")
-        kept = directory.resolve()
-        self._json = options.json
-        self._failure = ""
-        self._plan = msgspec.structs.replace(
-            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
-            page=audited(plan.page, kept / f"audit-{plan.host}.jsonl"))
 
-    async def run(self, link: socket.socket) -> int:
-        """Take part until the run is over, and return the exit code.
+async def take_part(plan: RunPlan, link: socket.socket, *, as_json: bool) -> int:
+    """Take part in a run until it is over, and return the exit code.
 
-        Args:
-            link: connection to the root.
+    Args:
+        plan: as of `plan_of_host`.
+        link: connection to the root.
+        as_json: print the end as JSON.
 
-        Raises:
-            UsageError: the first host refuses this host.
-            LaunchError: the processes of this host cannot be started.
-        """
-        launcher, task, why = OtherLauncher(self._plan, _say, link), asyncio.current_task(), ""
-        assert task is not None  # noqa: S101 for the type checker
+    Raises:
+        UsageError: the first host refuses this host.
+        LaunchError: the processes of this host cannot be started.
+    """
+    launcher, task, why = OtherLauncher(plan, _say, link), asyncio.current_task(), ""
+    assert task is not None  # noqa: S101 for the type checker
 
-        def interrupt(_signal: str) -> None:
-            launcher.on_interrupt = lambda _signal: None  # the end has begun
-            task.cancel()
+    def interrupt(_signal: str) -> None:
+        launcher.on_interrupt = lambda _signal: None  # the end has begun
+        task.cancel()
 
-        launcher.on_interrupt = interrupt
-        try:
-            await launcher.connect()
-            await launcher.join()
-            await launcher.start()
-            why = await self._stay(launcher)
-        except asyncio.CancelledError:
-            task.uncancel()
-        except MeetingError as error:
-            raise UsageError(f"--host {self._plan.host}: {error}") from None
-        finally:
-            await launcher.end()
-        _say(f"the run is over: {why or self._failure or 'interrupted'}")
-        if self._json:
-            print(json.dumps({"format": FORMAT, "host": self._plan.host, "over": why}), flush=True)
-        return EXIT_OVER if why else EXIT_FAILED
+    launcher.on_interrupt = interrupt
+    try:
+        await launcher.connect()
+        await launcher.join()
+        await launcher.start()
+        why = await _stay(launcher)
+    except asyncio.CancelledError:
+        task.uncancel()
+    except MeetingError as error:
+        raise UsageError(f"--host {plan.host}: {error}") from None
+    finally:
+        await launcher.end()
+    _say(f"the run is over: {why or launcher.failure or 'interrupted'}")
+    if as_json:
+        print(json.dumps({"format": FORMAT, "host": plan.host, "over": why}), flush=True)
+    return EXIT_OVER if why else EXIT_FAILED
 
-    async def _stay(self, launcher: OtherLauncher) -> str:
-        plan = launcher.plan
-        clock = clock_of(plan)
 
-        def event(event: ProcessEvent, stamp_s: float) -> None:
-            if event.event not in {"started", "running"}:
-                _say(f"{stamp_s:8.2f} s  {event.node} {event.event} "
-                     f"{one_line(event.detail)}".rstrip())
+async def _stay(launcher: OtherLauncher) -> str:
+    """Show what happens to the processes of this host until the run is over; return why it is."""
+    plan = launcher.plan
+    clock = clock_of(plan)
 
-        launcher.report = _say
-        launcher.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} restarted")
-        name = on_host(OBSERVER, plan.host)
-        observer = HostObserver(Context(
-            name, 1, clock, launcher.observers_bus(), {"supervisor": plan.supervisor},
-            register=register_of(plan.folder), members=frozenset(launcher.names)),
-            event)
-        task = asyncio.create_task(observer.run())
-        watch(task, f"the launcher's {name}", launcher.failed)
-        _say(f"host {plan.host} takes part in run {plan.run_id}; ctrl-C ends it here")
-        try:
-            why = await launcher.stay()
-            self._failure = launcher.failure
-            return why
-        finally:
-            observer.stop()
-            with contextlib.suppress(Exception):
-                await task
+    def event(event: ProcessEvent, stamp_s: float) -> None:
+        if event.event not in {"started", "running"}:
+            _say(f"{stamp_s:8.2f} s  {event.node} {event.event} "
+                 f"{one_line(event.detail)}".rstrip())
+
+    launcher.report = _say
+    launcher.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} restarted")
+    name = on_host(OBSERVER, plan.host)
+    observer = HostObserver(Context(
+        name, 1, clock, launcher.observers_bus(), {"supervisor": plan.supervisor},
+        register=register_of(plan.folder), members=frozenset(launcher.names)),
+        event)
+    task = asyncio.create_task(observer.run())
+    watch(task, f"the launcher's {name}", launcher.failed)
+    _say(f"host {plan.host} takes part in run {plan.run_id}; ctrl-C ends it here")
+    try:
+        return await launcher.stay()
+    finally:
+        observer.stop()
+        with contextlib.suppress(Exception):
+            await task
 
 
 def _say(line: str) -> None:

@@ -391,11 +391,11 @@ def _in_child(run: Callable[[], Coroutine[Any, Any, int]]) -> int:
 def _on_another_host(options: argparse.Namespace, plan: RunPlan, reports: Path) -> int:
     directory = Path(options.report) if options.report else (
         reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{plan.host}")
-    from rampart.cli.host import HostRun  # noqa: PLC0415 few runs have several hosts
+    from rampart.cli.host import plan_of_host, take_part  # noqa: PLC0415 few runs have several hosts
 
     with _kept(directory):
-        host, root = HostRun(options, plan, directory), Root()
-        code = root.run(lambda link: _in_child(lambda: host.run(link)))
+        part, as_json = plan_of_host(options, plan, directory), options.json
+        code = Root().run(lambda link: _in_child(lambda: take_part(part, link, as_json=as_json)))
         if code is None:
             _say("the process that watched this host was killed: its part of the run has ended")
             return EXIT_FAILED

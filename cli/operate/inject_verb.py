@@ -359,15 +359,9 @@ async def _hit_process(options: argparse.Namespace) -> int:
         UsageError: there is no run or no such node, or an option does not go with it.
     """
     what, _, node = options.fault.partition(":")
-    if "@" in node or "+" in node:
-        raise UsageError(f"{options.fault}: the fault is injected now; expected --duration S "
-                         "instead of @WHEN or +S")
-    if what == "hang":
-        raise UsageError(f"{options.fault}: only from the start of a run, by --fault "
-                         f"{options.fault}; expected stop:{node} or wedge:{node}")
-    if what == "slow":
-        raise UsageError(f"{options.fault}: only in virtual time: --virtual --fault "
-                         f"{options.fault}")
+    if what in {"hang", "slow"} or "@" in node or "+" in node:
+        raise UsageError(f"{options.fault}: only from the start of a run, by --fault (slow: in "
+                         "virtual time); here kill:NODE, stop:NODE or wedge:NODE, and --duration")
     if what != "stop" and options.duration is not None:
         raise UsageError(f"--duration {options.duration:g}: {what} ends when the node is restarted")
     _refuse_details(options)
