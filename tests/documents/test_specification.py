@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from rampart.actors.ros2.translation.tables import Ros2Link
+from rampart.cli.main import main
 from rampart.manager.model.gates import detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.schema import (
@@ -30,7 +31,7 @@ from rampart.manager.spec.specification import SpecificationError, parse_specifi
 from rampart.manager.spec.tables import End
 from rampart.testing import virtual_run
 from tests import TANK
-from tests.documents.page import Page, succeed
+from tests.documents.page import Page
 
 PAGE = Page("reference/specification")
 MODULES, JUDGE = PAGE.of("python")
@@ -97,12 +98,12 @@ against = { within_s = 5.0, hazard = "h" }
         parse_specification(text.replace("[orders.safer]\n", ""), "x.toml")
 
 
-def test_the_worked_example_is_a_sound_system(tmp_path):
+def test_the_worked_example_is_a_sound_system(tmp_path, capsys):
     spec = parse_specification(TANK, "tank.toml")
     assert spec.build_ftm_tree().parents == {"M_LEVEL": None, "M_CRASH": "M_LEVEL"}
     (tmp_path / "tank.toml").write_text(TANK, encoding="utf-8")
-    rows = json.loads(succeed("rampart table --system tank.toml --json", tmp_path))
-    assert [row["rm"] for row in rows] == [
+    assert main(["table", "--system", str(tmp_path / "tank.toml"), "--json"]) == 0
+    assert [row["rm"] for row in json.loads(capsys.readouterr().out)] == [
         ["R_SHUT"], ["R_RESTART"], ["R_SHUT", "R_RESTART"]]
 
 

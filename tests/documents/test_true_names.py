@@ -40,39 +40,32 @@ def is_there(dotted: str) -> bool:
     return True
 
 
+@pytest.fixture(scope="module")
+def verbs() -> set[str]:
+    return {verb for action in build_parser()._actions  # argparse has no other way
+            if isinstance(action, argparse._SubParsersAction) for verb in action.choices}
+
+
 @pytest.mark.parametrize("page", PAGES)
-def test_files_and_folders_are_there(page):
-    said = set(re.findall(rf"`((?:{TOPS})/[\w./-]*)`", PAGES[page])) - KEYS
+def test_files_links_modules_and_verbs_are_there(page, verbs):
+    text, here = PAGES[page], ROOT / page
+    said = set(re.findall(rf"`((?:{TOPS})/[\w./-]*)`", text)) - KEYS
     assert [path for path in said if not (ROOT / path).exists() and path.lower() == path] == []
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page):
-    here, lost = ROOT / page, []
-    for target, anchor in re.findall(r"\]\((?!http)([^)#\s]*)(?:#([^)]+))?\)", PAGES[page]):
+    lost = []
+    for target, anchor in re.findall(r"\]\((?!http)([^)#\s]*)(?:#([^)]+))?\)", text):
         file = here.parent / target if target else here
         if not file.exists() or (anchor and anchor not in anchors(file)):
             lost.append(f"{target}#{anchor}")
     assert lost == []
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_modules_and_classes_are_there(page):
-    said = set(re.findall(r"\brampart(?:\.[A-Za-z_]\w*)+(?::\w+)?", PAGES[page]))
+    said = set(re.findall(r"\brampart(?:\.[A-Za-z_]\w*)+(?::\w+)?", text))
     # These are no modules but metadata and entry points.
     said -= {"rampart.run", "rampart.end", "rampart.verbs", "rampart.campaigns"}
     assert {name for name in said if not is_there(name)} == set()
-    run = re.findall(r"python -m ((?:tests|benchmarks)[.\w]+)", PAGES[page])
+    run = re.findall(r"python -m ((?:tests|benchmarks)[.\w]+)", text)
     assert [m for m in run if not (ROOT / m.replace(".", "/")).with_suffix(".py").exists()] == []
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_verbs_are_there(page):
-    known = {verb for action in build_parser()._actions  # argparse has no other way
-             if isinstance(action, argparse._SubParsersAction) for verb in action.choices}
     said = set(re.findall(
-        r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z0-9-]*)", PAGES[page], re.MULTILINE))
-    assert said <= known
+        r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z0-9-]*)", text, re.MULTILINE))
+    assert said <= verbs
 
 
 def test_no_text_installs_another_project_s_package():
