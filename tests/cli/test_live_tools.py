@@ -19,6 +19,7 @@ import websockets
 from prometheus_client import parser
 
 from rampart.actors.osmosis.control.teleoperation.joystick_device import AXIS, BUTTON, EVENT
+from rampart.cli.main import main
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.cli.pseudo_terminal import PseudoTerminal
@@ -75,10 +76,9 @@ def twist(message: dict) -> tuple[float, float]:
 # -- top ----------------------------------------------------------------------------------------
 
 
-def test_top_tells_a_script_everything_once(run):
-    told = run.tool("top", "--json")
-    assert told.returncode == 0, told.stderr
-    data = json.loads(told.stdout)
+def test_top_tells_a_script_everything_once(run, capsys):
+    assert main(["top", "--json", "--port", str(run.port)]) == 0
+    data = json.loads(capsys.readouterr().out)
     assert data["mission"]["phase"] == "running"
     assert "safe so far" in data["safety"]
     processes = {row["name"]: row for row in data["processes"]}
@@ -156,11 +156,10 @@ def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
         assert it.is_as_before
 
 
-def test_the_keyboard_needs_a_terminal_and_a_joystick_its_device(run):
-    for arguments, words in (((), "expected a terminal"),
-                             (("--device", "/nonexistent/js0"), "No such file")):
-        told = run.tool("joystick", *arguments)
-        assert (told.returncode, words in told.stderr) == (2, True)
+def test_the_keyboard_needs_a_terminal_and_a_joystick_its_device(run, refused):
+    assert "expected a terminal" in refused("joystick", "--port", run.port)
+    missing = "/nonexistent/js0"
+    assert "No such file" in refused("joystick", "--port", run.port, "--device", missing)
 
 
 # -- metrics ------------------------------------------------------------------------------------
