@@ -173,3 +173,20 @@ async def test_a_wrong_route_is_refused_and_a_good_one_for_the_same_goal_driven_
     assert (status.phase, status.step) == (
         (m.ControlPhase.FOLLOWING, 0) if step == 0 else (m.ControlPhase.REFUSED, 1))
     assert (command.linear_mps > 0.2) is (step == 0)
+
+
+@in_system(system=shipped_system(), airport=AIRPORT)
+async def test_a_route_to_another_goal_is_refused_until_that_is_the_goal(system):
+    told = system.hear(topics.CONTROL_STATUS)
+    system.start("control", OsmosisControl, check_route=True)
+    await system.settle()
+    system.say(topics.GOAL, m.GoalOrder("m1", 0, DOWN, True))
+    way = ((START.x_m, START.y_m), (START.x_m, START.y_m - 8.0))
+    system.say(topics.ROUTE, m.Route("m1", 0, Mode.TAXI, True, way, ""))
+    for phase in (m.ControlPhase.REFUSED, m.ControlPhase.FOLLOWING):
+        for i in range(10):
+            system.say(topics.POSE, m.Pose(START.x_m, START.y_m, START.yaw_rad))
+            system.say(topics.SCAN, full_sweep(number=i))
+            await asyncio.sleep(0.05)
+        assert told[-1].message.phase is phase
+        system.say(topics.GOAL, m.GoalOrder("m1", 0, m.Goal(*way[-1], Mode.TAXI), True))
