@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from types import SimpleNamespace
 
 import msgspec
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
@@ -19,9 +17,8 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.clock import Clock
-from rampart.cli import following
 from rampart.cli.following import draw
-from rampart.cli.look.top import Frame, frame_of, picture_json, screen
+from rampart.cli.look.top import Frame, picture_json, screen
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import RunPicture
 from rampart.systems import DEFAULT
@@ -144,14 +141,3 @@ def test_the_same_can_be_had_as_data():
         "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
         "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
         "late_s": 0.0, "host": "", "failing": False}
-
-
-@pytest.mark.parametrize("replay_of", ["", "run.mcap"])
-def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
-    mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
-    monkeypatch.setattr(following, "draw", lambda _session, picture: told(
-        picture, ftm_topics.NODES, mine))
-    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB", replay_of=replay_of)
-    shown = frame_of(following.Watch(SimpleNamespace(run=run, clock=Clock(0.0))))
-    assert list(shown.usage) == ([] if replay_of else ["hmi", "launch.py"])
-    assert [row["name"] for row in shown.guards] == ([] if replay_of else ["launch.py"])
