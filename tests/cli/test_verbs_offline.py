@@ -36,7 +36,7 @@ def told(capsys) -> str:
 
 
 def test_the_table_holds_every_non_empty_set_once_in_the_promised_shape(capsys):
-    assert main(["table", "--json"]) == 0
+    assert main(["decide", "--json"]) == 0
     rows = json.loads(told(capsys))
     assert len(rows) == 2**7 - 1
     assert len({tuple(row["active"]) for row in rows}) == 127
@@ -55,6 +55,10 @@ def test_a_decision_is_the_papers_with_path_and_rejected(capsys, active, block, 
     assert (decision["block"], decision["rm"]) == (block, rm)
     assert decision["path"]
     assert all(set(r) == {"name", "reason"} for r in decision["rejected"])
+    assert main(["decide", *active]) == 0
+    text = told(capsys)
+    for shown in (*active, *rm, *decision["path"], *(r["reason"] for r in decision["rejected"])):
+        assert shown in text
 
 
 @pytest.fixture(autouse=True)
