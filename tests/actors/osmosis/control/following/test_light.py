@@ -5,7 +5,7 @@ import pytest
 
 from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
-from rampart.actors.osmosis.control.following.light_inspection import (
+from rampart.actors.osmosis.control.following.light_ledger import (
     LightInspection,
     verdict,
 )
