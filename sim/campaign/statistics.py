@@ -205,10 +205,8 @@ def interval(found: Rate) -> str:
     return f"{percent(found.low)} to {percent(found.high)} %" if found.of else ""
 
 
-def seconds(value: float | None) -> str:
+def seconds(value: float) -> str:
     """Return a time with three digits: milliseconds below a second."""
-    if value is None:
-        return NONE
     if value < 0.9995:
         return f"{value * 1e3:.0f} ms"
     return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f} s"

@@ -71,6 +71,8 @@ async def test_of_3000_lights_many_are_drawn_the_others_counted_and_one_costs_wh
         await tab.until("document.getElementById('left-out').textContent"
                         ".endsWith('4800 of the manager left out.')")
         assert await tab.value("document.getElementById('resets').children.length") == 1
+        shown = json.loads(hmi._server._feed.frame(0))["manager"]["value"]
+        assert [len(shown[name]) for name in ("active", "latched")] == [200, 1]
 
 
 def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_again():

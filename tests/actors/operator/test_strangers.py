@@ -81,7 +81,7 @@ async def test_another_user_who_is_gone_before_it_is_looked_at_is_not_taken_for_
     handlers = hmi._server._handlers
     hmi._server._handlers = msgspec.structs.replace(
         handlers, came=lambda page: (seen.append(page), handlers.came(page))[1])
-    code = f"for _ in range(100): {upgrade}; c.close()"
+    code = f"for _ in range(200): {upgrade}; c.close()"
     assert await output(as_nobody(await served(hmi), code)) == ""
     assert seen == []
 
