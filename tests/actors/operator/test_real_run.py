@@ -121,6 +121,9 @@ def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, m
     with RealRun(tmp_path, "paper", "--mission", short(tmp_path), "--rate", "4", "--hmi-port",
                  str(port), "--record", str(bag), hmi=True) as run:
         run.sleep_until(2.0)
+        said = run.tool("status", "--json").stdout
+        assert f"http://127.0.0.1:{port}/" in said
+        assert TOKEN not in said
         at = f"http://127.0.0.1:{port}/nothing"
         bearer = {"Authorization": f"Bearer {TOKEN}"}
         assert [httpx.get(at, headers=h).status_code for h in ({}, bearer)] == [401, 404]
@@ -135,9 +138,6 @@ def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, m
         inherited = [pid for pid in pids[1:]
                      if TOKEN.encode() in Path(f"/proc/{pid}/environ").read_bytes()]
         assert inherited == []
-        said = run.tool("status").stdout + run.tool("status", "--json").stdout
-        assert f"http://127.0.0.1:{port}/" in said
-        assert TOKEN not in said
         code, result = run.result()
     assert code == 0
     record = json.loads(Path(result["record"]).read_text())
