@@ -121,7 +121,7 @@ def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, m
     with RealRun(tmp_path, "paper", "--mission", short(tmp_path), "--rate", "4", "--hmi-port",
                  str(port), "--record", str(bag), hmi=True) as run:
         run.sleep_until(2.0)
-        said = run.tool("status", "--json").stdout
+        said = run.tool("status").stdout + run.tool("status", "--json").stdout
         assert f"http://127.0.0.1:{port}/" in said
         assert TOKEN not in said
         at = f"http://127.0.0.1:{port}/nothing"
