@@ -120,19 +120,18 @@ def progress() -> Iterator[Callable[[str], None]]:
         show("")
 
 
-def rendered(template: Path, *, escaped: bool = False, **values: Any) -> str:
+def rendered(template: Path, **values: Any) -> str:
     """Return a filled-in Jinja template, with numbers in their shortest form.
 
     Args:
         template: file of the template.
-        escaped: escape the values for XML.
         values: values by name.
     """
     import jinja2  # noqa: PLC0415 few verbs need it
 
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
-        autoescape=escaped,  # noqa: S701 Markdown needs no escapes
+        autoescape=False,  # noqa: S701 Markdown needs no escapes
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         finalize=lambda value: f"{value:g}" if isinstance(value, float) else value)
     return pages.get_template(template.name).render(values)

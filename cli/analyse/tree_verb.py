@@ -19,7 +19,7 @@ from rich.cells import cell_len
 
 from rampart.cli import systems
 from rampart.cli.output import UsageError, say, unknown
-from rampart.cli.verbs import add_verb, option, word
+from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
 from rampart.files.plain_text import one_line
 from rampart.manager.drawing.diagram import WHATS, Box, Diagram, Situation, draw
 from rampart.manager.drawing.placing import place
@@ -139,8 +139,7 @@ def add(verbs: Any) -> None:
                     help="which diagrams (default: all)"),
              option("--format", choices=tuple(FORMATS),
                     help="format (default: by the ending of --output, else text)"),
-             option("--json", action="store_const", dest="format", const="json",
-                    help="same as --format json"),
+             JSON_FORMAT,
              word("--output", "FILE", "write to FILE instead of standard output"),
              option("--order", metavar="NAME", action="append",
                     help="order of recoveries; repeatable: each decides the pairs that the "
