@@ -399,6 +399,14 @@ def test_a_state_is_saved_once_and_the_last_generations_are_kept():
     assert desk.told == []
 
 
+def test_the_first_process_expects_nothing_and_a_later_one_reports_that_nothing_was_found():
+    first, later = Desk(MemoryCheckpoints([], 1)), Desk(MemoryCheckpoints([], 2), expected=True)
+    assert first.count() is None
+    assert later.count() is None
+    assert first.told == []
+    assert later.told == ["no checkpoint was found; starting without a checkpoint"]
+
+
 def test_a_state_that_makes_no_sense_gives_way_to_the_one_before_in_one_line():
     shelf = [record(3, {"count": -1, "step": 0}, 9), record(4, {}, 8),
              record(3, {"count": 4, "step": 0}, 7)]
