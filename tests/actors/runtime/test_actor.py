@@ -231,6 +231,18 @@ async def test_what_a_newcomer_hears_of_before_is_each_topics_last_if_that_is_no
             assert said[-1] == fm.Reset("RM2", "you"), "a command is given once, to those present"
 
 
+async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bus):
+    class Deaf(Listener):
+        def listens(self, topic) -> bool:
+            return topic is not topics.POSE
+
+    async with talking(make_bus, Deaf) as (deaf, talker):
+        talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
+        await eventually(lambda: bool(deaf.heard))
+        assert [message for message, _ in deaf.heard] == [fm.Reset("RM1", "you")]
+
+
 def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     """Python would let it happen in silence: a node's `_held` once stopped the node's mailbox."""
 
