@@ -319,4 +319,7 @@ def test_the_command_prints_a_table_and_the_traces_of_the_system_s_strategy(
                   "mission-first and simultaneous: --strategy NAME", "fails under safety-first"):
         assert words in told
     assert "fails under mission-first" not in told
-    assert main(["verify", "paper"]) == 0
+    assert main(["verify", "paper", *(f"--strategy={name}" for name in STRATEGIES)]) == 0
+    told = capsys.readouterr().out
+    assert "fails under mission-first" in told
+    assert "--strategy NAME" not in told

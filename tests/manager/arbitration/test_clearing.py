@@ -90,14 +90,14 @@ def test_a_reset_that_is_older_than_the_latch_has_no_effect(number):
 
 
 def test_a_manager_that_is_started_again_knows_since_when_the_error_is_gone():
-    run = bench(clear_after_s=5.0).play(STOPPED)
+    run = bench(clear_after_s=5.0).play(f"{STOPPED}; wait 3")
     later = bench(clear_after_s=5.0)
     later.now = run.now
     later.state = recall(later.arbiter, remember(run.state, run.arbiter), run.now, 10_000)
     later.play("wait 0.1 = RM2; active: FTM2")  # though RM2 died too, and the error is gone
     for rm in RMS:
         later.play(f"{rm} {'done' if rm == 'RM2' else 'idle'}")
-    later.play("wait 2 = RM2; refused RM2; wait 3; wait 0.1 =")
+    later.play("wait 0.4 = RM2; refused RM2; wait 1.5 =")
 
 
 def test_a_memory_with_an_impossible_time_is_refused():
