@@ -13,7 +13,7 @@ import pytest
 
 from rampart.sim.campaign.job import Job, RunResult, run_job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
-from rampart.sim.osmosis.trial import run_end
+from rampart.sim.osmosis.trial import mission_trial
 from tests import system_file
 
 LAYERS = ("dead_man", "safety_pilot_checks", "manager_watch", "supervisor_respawn", "ftm",
@@ -32,7 +32,7 @@ def job(tmp_path, monkeypatch):
     A run ends soon after the robot has come to stand, and an unguarded robot that drives away is
     not watched for a whole minute.
     """
-    monkeypatch.setattr(run_end, "WATCH_S", 2.0)
+    monkeypatch.setattr(mission_trial, "WATCH_S", 2.0)
 
     def made(system: str, layers: tuple[str, ...], *faults: str) -> Job:
         text = system_file(system).read_text(encoding="utf-8")
