@@ -53,16 +53,11 @@ async def test_a_pilot_that_lives_but_is_accused_is_respawned_with_the_brake_hel
     await asyncio.sleep(0.5)
     assert system.incarnations["safety_pilot"] == 2
     assert base.orders == [True, False]
-
-
-@in_system()
-async def test_while_the_pilot_does_not_come_back_the_brake_stays_until_released(system):
-    boss, base, supervisor = await braking(system)
     supervisor.answer = "given up"
-    boss.order("RM7", nodes=("safety_pilot#1",))
+    boss.order("RM7", decision=2, nodes=("safety_pilot#2",))
     await asyncio.sleep(1.0)
-    assert base.engaged
-    boss.release("RM7")
+    assert base.engaged, "it stays so while the pilot does not come back, until released"
+    boss.release("RM7", decision=3)
     await system.settle()
     assert not base.engaged
 
