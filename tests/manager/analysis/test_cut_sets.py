@@ -108,12 +108,12 @@ def test_hundreds_of_shared_events_and_millions_of_sets_are_counted_not_listed()
     assert [CutSets(ladder(n)).count for n in (1, 2, 5, 9)] == [2, 2, 5, 16]  # vertex covers
 
 
-def test_thousands_of_gates_in_a_chain_are_no_problem():
+def test_more_gates_in_a_chain_than_python_recurses_through_are_no_problem():
     gates = {f"g{i}": any_of(f"g{i + 1}", f"e{i}") if i % 2 else all_of(f"g{i + 1}", f"e{i}")
-             for i in range(2000)}
-    gates["g2000"] = any_of("last")
+             for i in range(1200)}
+    gates["g1200"] = any_of("last")
     found = CutSets(formula(gates))
-    assert found.count == 1001
+    assert found.count == 601
     with pytest.raises(TooLargeError, match="levels deep: expected at most"):
         list(found.sets())
 
