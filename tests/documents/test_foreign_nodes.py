@@ -32,6 +32,9 @@ def write_tug(folder, language: str = "") -> None:
     elif language:
         source = "wheels.rs" if language == "rust" else "wheels.c"
         (folder / source).write_text(PAGE.block(language.removesuffix("++")))
+        if language == "c++":  # the same file is C, too
+            subprocess.run(["gcc", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", source],
+                           cwd=folder, check=True)
         subprocess.run([*COMPILERS[language], "-o", "wheels", source], cwd=folder, check=True)
 
 
