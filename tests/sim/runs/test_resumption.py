@@ -86,20 +86,6 @@ def test_a_run_that_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, c
     assert "\n" not in str(refused.value)
 
 
-def test_any_cut_or_wrong_byte_of_a_manifest_is_one_line_or_harmless(tmp_path, system):
-    files = begun(tmp_path / "reports", "a", system)
-    whole = (files.directory / MANIFEST).read_bytes()
-    for at in range(0, len(whole), 3):
-        for data in (whole[:at], whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1:]):
-            (files.directory / MANIFEST).write_bytes(data)
-            told = ""
-            try:
-                find(tmp_path / "reports", "a")[0].unlock()
-            except ResumptionError as error:
-                told = str(error)
-            assert "\n" not in told
-
-
 def test_a_run_that_lives_is_not_resumed_and_one_that_is_just_ending_is_waited_for(
         tmp_path, system, monkeypatch):
     """Any process of the run keeps the lock, for it was forked with it."""

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.clock import Clock
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.sim.virtual.virtual_loop import VirtualLoop
 
 
 def run(scenario):
@@ -119,18 +118,6 @@ def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
 
     assert run(scenario) == [("killed", b"first"), ("other", b"first"),
                              ("other", b"second"), ("other", b"third")]
-
-
-def test_a_virtual_clock_shows_what_a_clock_of_the_same_loop_shows():
-    async def scenario():
-        loop = asyncio.get_running_loop()
-        await asyncio.sleep(0.3)
-        lean, plain = VirtualClock(loop, 1.7), Clock(1.7, source=loop.time)
-        await asyncio.sleep(12.345)
-        assert (lean.now(), lean.rate) == (plain.now(), plain.rate)
-        assert lean.source_time(5.1) == plain.source_time(5.1)
-
-    run(scenario)
 
 
 def test_files_are_served_while_time_stands_still():
