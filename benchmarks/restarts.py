@@ -30,7 +30,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import Member, load_application
-from rampart.cli.output import print_rows, progress, unknown
+from rampart.cli.output import UsageError, print_rows, progress, unknown
 from rampart.cli.session import Session, connect
 from rampart.manager.spec.nodes import Kind
 
@@ -229,7 +229,10 @@ def main() -> int:
                         "repeatable (default: all, one detection and one recovery module)")
     parser.add_argument("--kills", type=int, default=5, metavar="N", help="of each node")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    return asyncio.run(measure(parser.parse_args()))
+    try:
+        return asyncio.run(measure(parser.parse_args()))
+    except UsageError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":
