@@ -22,7 +22,7 @@ from rampart.manager.arbitration.arbiter_state import (
 from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.strategies.registry import STRATEGIES
-from tests.manager.bench import DMS, RMS, Bench, edited, paper
+from tests.manager.bench import DMS, RMS, Bench, commands, edited, paper
 
 ACTING, DONE, IDLE = RecoveryPhase.ACTING, RecoveryPhase.DONE, RecoveryPhase.IDLE
 CONTROL = "osmosis_control"
@@ -275,6 +275,13 @@ def test_a_command_says_for_which_nodes_why_and_of_which_decision():
                 if isinstance(o, Command))
     assert (order.nodes, order.decision) == ((CONTROL, "graph_planner"), 2)
     assert [d.decision.rule for d in bench.decisions] == [1, 1]
+
+
+def test_another_node_crashing_right_at_the_deadline_is_no_failure_either():
+    bench = Bench(edited(RM3={"deadline_s": 0.5})).play(f"DM4 {CONTROL}; RM3 done")
+    bench.now = 0.6
+    assert commands(bench.active("DM4", "graph_planner")) == [("RM3", True)]
+    assert bench.state.desired["RM3"].nodes == ("graph_planner",)
 
 
 def test_a_reset_that_is_refused_is_told_why():
