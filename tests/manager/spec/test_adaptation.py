@@ -73,6 +73,7 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'"),
     ("retune", "FTM3", {}, "retune FTM3: expected fields and their new values"),
     ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
+    ("replace", "DM1", {"parameters": 3}, "detection DM1: parameters = 3: expected a table"),
     ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
     ("set", "strategy", {}, "set strategy: expected a value"),
