@@ -113,6 +113,9 @@ def _check(options: argparse.Namespace) -> None:
                                ("--seeds", options.seeds, 1), ("--jobs", options.jobs, 0)):
         if value is not None and value < least:
             raise UsageError(f"{name} {value}: must be {least} or more")
+    if options.seeds and not options.fault:
+        raise UsageError(f"--seeds {options.seeds}: only with --fault; each run of {chosen[0]} has "
+                         "its own seed")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
     find_network(options.network)

@@ -353,6 +353,7 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
     (("--runs", "3", "--patience", "0"), "--patience 0"),
+    (("--runs", "3", "--seeds", "2"), "--seeds 2: only with --fault"),
     (("--replay", "ab"), "expected --out DIR"),
     (("--paper", "--out", "/dev/null/out"), r"no directory that can be written \(Not a directory"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),

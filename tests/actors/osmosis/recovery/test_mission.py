@@ -10,7 +10,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
-from rampart.actors.osmosis.messages import MissionPhase, Mode
+from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode
 from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.osmosis.recovery.return_home import ReturnHome
 from rampart.actors.runtime.actor import Actor, on
@@ -117,6 +117,18 @@ def test_the_robot_is_ordered_home_once_and_goes_on_doing_so_when_the_cause_is_g
         assert boss.phases == ["idle", "acting", "degraded", "idle"]
         assert manager.state.phase is MissionPhase.RETURNING
         assert len(manager.state.answers) == 1
+
+    come_home(scenario)
+
+
+def test_a_robot_on_its_way_home_already_is_left_alone():
+    async def scenario(boss, planner, manager):
+        manager.order(m.MissionOrder("o1", MissionAction.HOME, "lunch", "operator"), None)
+        await asyncio.sleep(0.5)
+        boss.order("RM9")
+        await asyncio.sleep(0.5)
+        assert boss.phases[-1] == "degraded"
+        assert manager.state.homing == "operator: lunch"
 
     come_home(scenario)
 
