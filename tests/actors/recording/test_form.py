@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, encode, pack
+from rampart.actors.bus.topic import ROS_SIDE
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
@@ -124,6 +125,13 @@ def test_a_sound_message_in_other_bytes_than_ours_keeps_them():
     text, header, body = form.recorded(payload)
     assert (header.stamp, body.x_m) == (3.0, 1.0)
     assert form.payload(text) == payload
+
+
+def test_a_message_of_ros_2_has_its_bytes_and_is_no_garbage():
+    form = form_of(f"{ROS_SIDE}/data/0|odom")
+    text, header, _ = form.recorded(b"\xc1")
+    assert (header, form.is_foreign, form.payload(text)) == (None, True, b"\xc1")
+    assert "error" not in json.loads(text)
 
 
 def test_the_text_raw_in_a_message_is_no_payload():

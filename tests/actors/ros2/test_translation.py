@@ -158,6 +158,23 @@ def test_what_a_sensor_says_it_does_not_know_is_none_and_the_rest_passes(kind, f
     assert {name for name in made.__struct_fields__ if getattr(made, name) is None} == unknown
 
 
+def test_fields_of_a_topic_that_no_class_declares_have_the_types_of_what_they_read():
+    kinds = {"buttons_count": ("count(buttons)", int), "what": ("'a joystick'", str),
+             "is_there": (True, bool), "frame": ("header.frame_id", str),
+             "turn": ("axes[0] * 2", float)}
+    link = Ros2Link(type="sensor_msgs/msg/JoyFeedbackArray", subscribe="/x", to="x",
+                    fields={"count": "count(array)"})
+    assert message_of(link, JAZZY)(count=2).count == 2
+    made = message_of(msgspec.structs.replace(link, type=JOY, fields={
+        name: said for name, (said, _) in kinds.items()}), JAZZY)
+    found = {field.name: field.type for field in msgspec.structs.fields(made)}
+    assert {name: getattr(found[name], "__origin__", found[name]) for name in kinds} == {
+        name: kind for name, (_, kind) in kinds.items()}
+    for name, said_ in (("no name", "axes"), ("stamp", "header.stamp")):
+        with pytest.raises(ValueError, match="expected"):
+            message_of(msgspec.structs.replace(link, type=JOY, fields={name: said_}), JAZZY)
+
+
 def test_of_several_publishers_no_message_replaces_another_one_s():
     link = Ros2Link(type="std_msgs/msg/Bool", subscribe="/x", to="x", publishers="any")
     assert topic_of(link, JAZZY).qos is Qos.COMMAND
