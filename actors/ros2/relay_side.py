@@ -360,8 +360,13 @@ def setup_file(setup: str, distribution: str) -> str:
 
 
 def _environment(domain: int) -> dict[str, str]:
-    """Return the environment of the relay: without our own virtual environment."""
-    found = inherited_environment() | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+    """Return the environment of the relay: without our own virtual environment.
+
+    A killed node can leave a lock in the shared memory of Fast DDS, at which all nodes of the
+    machine that start later hang (eProsima/Fast-DDS#5469), so the relay keeps off it.
+    """
+    found = ({"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"} | inherited_environment()
+             | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"})
     if sys.prefix != sys.base_prefix:
         found.pop("VIRTUAL_ENV", None)
         found["PATH"] = os.pathsep.join(one for one in found.get("PATH", "").split(os.pathsep)

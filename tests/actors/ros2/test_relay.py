@@ -115,6 +115,7 @@ def test_topics_services_and_actions_over_dds(tmp_path, system):
         peer.wait_for("up")
         with RealRun(tmp_path, path) as run:
             check_passing(run, peer)
+            assert relay_of(run).environ()["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
             run.wait_until(lambda: 3 in peer.said("goal"), 10, "no goal")
             assert "succeeded" in {one["phase"] for one in echoed(run, "count/state", 6)}
             told = json.loads(run.tool("status", "--json").stdout)["ros2"]
