@@ -220,12 +220,16 @@ async def test_what_a_newcomer_hears_of_before_is_each_topics_last_if_that_is_no
         make_bus, age_s, number):
     order = m.GoalOrder("m1", 0, m.Goal(1.0, 2.0, m.Mode.TAXI), True)
     slow = 0.05  # on a busy machine the newcomer takes a while
-    async with running(Talker, "talker", make_bus, rate=slow) as former:
+    async with (running(Listener, "witness", make_bus, rate=slow) as witness,
+                running(Talker, "talker", make_bus, rate=slow) as former):
+        await eventually(lambda: bool(witness.peers))
         now_s = former.clock.now()
         former.publish(topics.GOAL, order, stamp=now_s - 100.0)
         former.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0), stamp=now_s - age_s - 0.01)
         former.publish(topics.POSE, m.Pose(2.0, 0.0, 0.0), stamp=now_s - age_s)
         former.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
+        await eventually(lambda: {fm.Reset("RM1", "you"), m.Pose(2.0, 0.0, 0.0)} <= {
+            body for body, _ in witness.heard})  # all of it is past the router
         async with running(Listener, "listener", make_bus, rate=slow) as newcomer:
             await eventually(lambda: len(newcomer.heard) >= number)
             former.publish(ftm_topics.RESET, fm.Reset("RM2", "you"))
