@@ -124,6 +124,23 @@ class Node(Actor):
 
 
 @within(System)
+async def test_a_killed_node_and_its_return_are_reported_without_any_time_passing(system):
+    ear = system.start("ear", Ear)
+    for name in ("a", "b"):
+        system.start(name, Node)
+    system.start("DM4", Watchdog, watch=["a", "b"], timeout_s=0.35)
+    await asyncio.sleep(1.0)
+    await system.kill("b")
+    killed_s = system.clock.now()
+    await system.settle()
+    at, report = ear.heard[-1]
+    assert (at, report.state, report.nodes) == (killed_s, DetectionState.ACTIVE, ("b",))
+    system.start("b", Node)
+    await system.settle()
+    assert ear.states == ["idle", "active", "idle"]
+
+
+@within(System)
 async def test_without_a_supervisor_a_node_whose_loop_hangs_is_reported_after_twice_the_timeout(
         system):
     ear = system.start("ear", Ear)
