@@ -103,7 +103,6 @@ REFUSED = [
     ([*OF_TANK, "--fault", "kill:nobody"], "no node 'nobody' that a fault can hit; there are:"),
     ([*OF_TANK, "--patience", "7"], "--patience 7: tank has no mission"),
     ([*OF_TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
-    ([*OF_TANK, "--joystick"], f"--joystick: {NO_OPTION}"),
     *(([*OF_TANK, *page], "no node of tank serves an operator's page")
       for page in (["--wait"], ["--hmi-host", "0.0.0.0"])),
     ([*TWO, "--host", "moon", "--no-keys"], "--host moon: unknown; known: robot, ground"),
