@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -31,7 +32,8 @@ angular = "summit_xl/command:angular_radps"
 def everything(run, number):
     """Signal all processes of a run, the root first."""
     for process in sorted(find_processes(run.port), key=lambda p: p.names != ("root",)):
-        os.kill(process.pid, number)
+        with contextlib.suppress(ProcessLookupError):  # it ends of itself: its parent is gone
+            os.kill(process.pid, number)
 
 
 @pytest.mark.alone
