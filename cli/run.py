@@ -24,7 +24,7 @@ import msgspec
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.incidents import state_folder
 from rampart.actors.recording.process import Order, RecorderProcess
-from rampart.actors.recording.recorder import VirtualRecording, keys_elsewhere
+from rampart.actors.recording.recorder import VirtualRecording
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_document
@@ -187,7 +187,7 @@ class Run:
                     options.patience if kind.patient else options.duration, stream)
 
     async def _on_processes(self, run: ProcessRun) -> int:
-        with (_recorded(self._options, self._plan, self._trial.run.system) as recorder,
+        with (_recorded(self._options) as recorder,
               _black_box(self._plan, self._trial.run.system, _say) as run.keep_alive):
             if recorder is not None:
                 run.launcher.recording = lambda: (recorder.path, recorder.problem())
@@ -298,15 +298,13 @@ def _kept(directory: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
-              ) -> Iterator[RecorderProcess | None]:
+def _recorded(options: argparse.Namespace) -> Iterator[RecorderProcess | None]:
     """Record the run in a separate process, with --record."""
     if not options.record:
         yield None
         return
     recorder = RecorderProcess(Order(
-        options.port, str(Path(options.record).resolve()), os.getppid(), options.overwrite,
-        keys_elsewhere(Layout(plan, spec))))
+        options.port, str(Path(options.record).resolve()), os.getppid(), options.overwrite))
     recorder.start()
     try:
         yield recorder

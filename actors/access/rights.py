@@ -71,14 +71,6 @@ def rights_of_all(layout: Layout) -> dict[str, Rights]:
     return {**found, OPERATOR: viewer | operating, VIEWER: viewer}
 
 
-def published_elsewhere(layout: Layout) -> frozenset[str]:
-    """Return the keys that processes and people of the other hosts may publish."""
-    hosts, rights = layout.hosts, rights_of_all(layout)
-    there = {name for host in hosts.supervisors if host != layout.plan.host
-             for name in (*hosts.routers_of(host), *hosts.may_run(host, layout.members))}
-    return together((*(rights[name] for name in there), rights[OPERATOR])).publishes
-
-
 def _rights_of(member: Member, topics: Mapping[str, Topic[Any]]) -> Rights:
     own = frozenset(f"{ROOT}/{key}" for key in member.actor.own_keys(member.parameters))
     outputs, inputs = published(member), heard(member) | {t.key: None for t in BASE_INPUTS}

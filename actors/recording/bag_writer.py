@@ -243,11 +243,6 @@ class BagWriter:
         self._writer.flush()
         check_reserve(self._file.fileno())
 
-    @property
-    def written_bytes(self) -> int:
-        """Size of the file."""
-        return self._file.tell()
-
     def close(self, end: Mapping[str, str] | None = None) -> None:
         """Write counts and `end` as metadata, and close the file.
 

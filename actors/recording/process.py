@@ -49,7 +49,6 @@ class Order(msgspec.Struct, frozen=True):
         path: file; of a black box the folder of the system.
         launcher: pid of the launcher.
         overwrite: whether the file may exist.
-        elsewhere: key expressions of what other hosts publish.
         black_box: limits of a black box; None for a recording.
         again: whether a black box follows another one of this run, which has died.
     """
@@ -58,7 +57,6 @@ class Order(msgspec.Struct, frozen=True):
     path: str
     launcher: int
     overwrite: bool = False
-    elsewhere: tuple[str, ...] = ()
     black_box: Limits | None = None
     again: bool = False
 
@@ -195,7 +193,7 @@ def record(order: Order) -> int:
             streams.complain(str(error))
         _answer(f"error: {error}")
         return 1
-    if isinstance(recorder, Recorder) and recorder.files:
+    if isinstance(recorder, Recorder) and recorder.writer is not None:
         streams.complain(result_of(recorder))
     return 0
 
@@ -203,7 +201,7 @@ def record(order: Order) -> int:
 def _recorder(order: Order, path: Path) -> RunListener:
     if order.black_box is None:
         return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
-                        elsewhere=order.elsewhere, credentials=_launchers)
+                        credentials=_launchers)
     return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again)
 
 
@@ -218,13 +216,10 @@ def result_of(recorder: Recorder) -> str:
         return f"{recorder.path}: nothing was recorded"
     if not recorder.path.exists():
         return f"{recorder.path}: was removed while it was written: nothing is recorded"
-    files = recorder.files
-    lost = sum(sum(file.gaps.lost().values()) for file in files)
-    found = sum(file.garbage for file in files)
-    garbage = f", {found} of them garbage" if found else ""
-    more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
-    return (f"recorded {sum(file.messages for file in files)} messages in {recorder.path}{more}"
-            f"{garbage}, {lost or 'none'} lost")
+    lost = sum(recorder.writer.gaps.lost().values())
+    garbage = f", {recorder.writer.garbage} of them garbage" if recorder.writer.garbage else ""
+    return (f"recorded {recorder.messages} messages in {recorder.path}{garbage}, "
+            f"{lost or 'none'} lost")
 
 
 def _answer(text: str) -> None:

@@ -29,9 +29,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import result_of, stop_pipe
-from rampart.actors.recording.recorder import Recorder, keys_elsewhere
-from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.actors.system.layout import Layout
+from rampart.actors.recording.recorder import Recorder
 from rampart.actors.system.topics import declared_topics, system_topics
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
@@ -60,7 +58,6 @@ from rampart.cli.verbs import (
     whole,
     word,
 )
-from rampart.files import working_folder
 from rampart.files.plain_text import one_line
 
 _PORTS = (1024, 65535)
@@ -127,9 +124,9 @@ def record(options: argparse.Namespace) -> int:
     wants = _wanted(options.topics, run)
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     check_target(path, overwrite=options.overwrite)
+    credentials = tools_credentials(run)[0] if run.hosts else None
     recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
-                        elsewhere=_elsewhere(run),
-                        credentials=lambda run: tools_credentials(run)[0])
+                        credentials=lambda _run: credentials)
     recorder.open()
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
@@ -220,20 +217,6 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         return lambda _key: True
     return lambda key: any(
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
-
-
-def _elsewhere(run: RunInfo) -> tuple[str, ...]:
-    """Return key expressions of what other hosts of a run publish.
-
-    Raises:
-        UsageError: the specification or the folder of keys cannot be used.
-    """
-    if not run.hosts:
-        return ()
-    plan = RunPlan(system_file=run.system_file, host=run.host)
-    tools_credentials(run)
-    working_folder.admit(Path(run.system_file).parent)
-    return keys_elsewhere(Layout(plan, load_system(plan)))
 
 
 def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:

@@ -13,20 +13,27 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import pytest
+import zenoh
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from rampart.actors.bus import recorder_connection as wire
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.recorder_connection import RecorderConnection, frame, parse_frame
 from rampart.actors.bus.run_info import RunInfo
+from rampart.actors.bus.topics import HEARTBEAT
+from rampart.actors.bus.zenoh_session import endpoint, session_config
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
-from rampart.actors.recording.process import Order, RecorderProcess, result_of
+from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
@@ -244,27 +251,6 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
     assert error.count("\n") == 1
 
 
-def test_a_recording_that_becomes_large_goes_on_in_another_file(
-        port, launcher, tmp_path, monkeypatch):
-    monkeypatch.setattr("rampart.actors.recording.recorder.FILE_BYTES", 30_000)
-    monkeypatch.setattr("rampart.actors.recording.recorder.Recorder.flush_s", 0.05)
-    recorder = Recorder(port, tmp_path / "run.mcap", launcher=launcher.pid)
-    recorder.open()
-    with AnsweringLauncher(port, time.monotonic(), launcher.pid), running(recorder):
-        robot = Robot(port)
-        wait_until(lambda: bool(robot.send(20)) or len(recorder.files) > 2, 20, "one file")
-    robot.connection.close()
-    files = [tmp_path / "run.mcap", *sorted(tmp_path.glob("run-*.mcap"))]
-    assert len(files) >= 3
-    assert [n for file in files for n in numbers(file)] == list(range(1, robot.sent + 1))
-    for file in files:
-        summary = Summary(BagReader(file))
-        assert (summary.reader.closed, summary.reader.damage) == (True, "")
-        assert summary.end["lost"] == "{}"
-    assert "run-2.mcap" in Summary(BagReader(files[0])).end["ended"]
-    assert f"recorded {robot.sent} messages" in result_of(recorder)
-
-
 def test_a_disk_without_room_for_others_ends_the_recording(tmp_path, monkeypatch):
     with (tmp_path / "run.mcap").open("wb") as file:
         writer = BagWriter(file, documents())
@@ -322,6 +308,49 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
     assert list(tmp_path.iterdir()) == []
     own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "", (), "r1", 0, "porter")
     assert record_verbs._wanted(["porter/*"], own)("rampart/porter/speed")
+
+
+@pytest.mark.processes
+def test_of_other_hosts_each_message_that_comes_by_the_bus_is_written_once_and_in_order(
+        port, tmp_path):
+    path, origin_s = tmp_path / "run.mcap", time.monotonic()
+
+    def beat(source, sequence, incarnation=1):
+        header = Header(source, incarnation, sequence, time.monotonic() - origin_s)
+        return HEARTBEAT.at(source), encode(header, Heartbeat(1, 2, 0.1, 0, 0))
+
+    folder = run_folder.make(port, os.getpid())
+    recorder = Recorder(port, path, launcher=os.getpid())
+    router = zenoh.open(session_config([endpoint(folder, "router_a")], []))
+    try:
+        with AnsweringLauncher(port, origin_s) as launcher:
+            launcher.info = msgspec.structs.replace(
+                launcher.info, folder=folder, hosts={"robot": "supervisor", "ground": "other"})
+            recorder.open()
+            here = RecorderConnection(port)
+            listened = router.declare_publisher(HEARTBEAT.at("hmi"))
+            with running(recorder):
+                wait_until(lambda: listened.matching_status.matching, 10, "nobody listens")
+                for message in ((HEARTBEAT.at("pilot"), b"\xc1"), beat("hmi", 1, 1_000_001)):
+                    here.take(*message)
+                    router.put(*message)
+                for number in range(1, 51):
+                    here.take(*beat("pilot", number))
+                    for name in ("pilot", "hmi"):  # the pilot's has been handed over, too
+                        router.put(*beat(name, number))
+                router.put(HEARTBEAT.at("hmi"), b"\xc2")
+                wait_until(lambda: recorder.messages >= 103, 10, "they are not recorded")
+            here.close()
+    finally:
+        router.close()
+        run_folder.remove(folder)
+    found = [(key, message.sequence, message.log_time)
+             for channel, message in BagReader(path).messages() if (key := key_of(channel))]
+    for name, more in (("pilot", [0]), ("hmi", [0, 1])):  # garbage, and of a process here
+        assert sorted(n for key, n, _ in found if key == HEARTBEAT.at(name)) == sorted(
+            [*more, *range(1, 51)])
+    assert [at for _, _, at in found] == sorted(at for _, _, at in found)
+    assert json.loads(Summary(BagReader(path)).end["lost"]) == {}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
