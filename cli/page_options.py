@@ -15,9 +15,16 @@ from pathlib import Path
 
 import msgspec
 
-from rampart.actors.web.access import ANY, Access, AccessError, check_token, is_loopback, new_token
+from rampart.actors.web.access import (
+    ANY,
+    Access,
+    AccessError,
+    PagePlan,
+    check_token,
+    is_loopback,
+    new_token,
+)
 from rampart.actors.web.listening import PortError, listen
-from rampart.actors.web.page_plan import PagePlan
 from rampart.actors.web.tls import Certificate, TlsError, days_left, holds_key, load
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visitors

@@ -166,8 +166,8 @@ class Run:
                              "layers.checkpoints, one host, and a judge that can resume")
         if why := differences(before, self._manifest):
             raise UsageError(f"--resume {files.directory}: {why}")
-        begins_s, problems = files.recall(before.run_id, self._trial.recall)
-        for problem in problems:
+        begins_s, problem = files.recall(before.run_id, self._trial.recall)
+        if problem:
             _say(problem)
         self._plan = msgspec.structs.replace(
             self._plan, run_id=before.run_id, part=before.part + 1,

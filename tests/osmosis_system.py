@@ -13,7 +13,7 @@ from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
 from rampart.actors.runtime.run_plan import RunPlan
-from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.access import PagePlan
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 from rampart.testing import VirtualSystem
 from tests.virtual_time import Test, within

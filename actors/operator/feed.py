@@ -4,10 +4,9 @@ A change is sent in the same turn of the event loop, unless the last frame is yo
 `FRAME_GAP_S`. Pages at the same version share a frame.
 
 *No backlog.* The buffers up to a browser can hold minutes of frames, so a slow page would show the
-past. A page therefore reports each frame that it has drawn. It never has more than `IN_FLIGHT`
-frames that it has not drawn, and then gets the newest one. A client that never reports (a script)
-is bounded by its socket only. A page that takes nothing for `SEND_TIMEOUT_S` is disconnected; when
-it reconnects it gets everything.
+past. A page therefore reports each frame that it has drawn, and only then gets the newest one. A
+client that never reports (a script) is bounded by its socket only. A page that takes nothing for
+`SEND_TIMEOUT_S` is disconnected; when it reconnects it gets everything.
 
 While no page is open, nothing runs here.
 """
@@ -30,21 +29,21 @@ LOOK_S = 1.0
 """Real seconds between two looks for silent publishers and at the usage of processes."""
 
 SEND_TIMEOUT_S = 5.0
-IN_FLIGHT = 2
 
 
 class PageFeed:
-    """An open page: the versions that were sent to it, and those that it has drawn.
+    """An open page.
 
     Attributes:
-        version: the newest version that was sent.
+        version: the newest version that was sent to it.
+        news: set when the picture is newer.
+        drawn: set while it has nothing left to draw.
     """
 
     def __init__(self) -> None:
         self.version = 0
         self.news = asyncio.Event()
         self.drawn = asyncio.Event()
-        self._on_the_way: list[int] = []
         self._answers = False
         self.drawn.set()
 
@@ -52,15 +51,14 @@ class PageFeed:
         """Note that a version is sent to it."""
         self.version = version
         self.news.clear()
-        self._on_the_way = [*self._on_the_way, version][-IN_FLIGHT:]  # it may never report
-        if self._answers and len(self._on_the_way) == IN_FLIGHT:
+        if self._answers:  # a script may never report
             self.drawn.clear()
 
     def seen(self, version: int) -> None:
         """Note that it has drawn a frame, and so all earlier ones."""
         self._answers = True
-        self._on_the_way = [v for v in self._on_the_way if v > version]
-        self.drawn.set()
+        if version >= self.version:
+            self.drawn.set()
 
 
 class Feed:

@@ -51,7 +51,6 @@ from rampart.actors.runtime.parameters import Named, TopicsPublished, named
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.web.access import Access, AccessError, is_loopback
 from rampart.actors.web.audit import AuditLog
-from rampart.actors.web.gate import Gate
 from rampart.actors.web.listening import PortError
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
@@ -200,10 +199,9 @@ class Hmi(Actor):
     def _hello(self) -> dict[str, Any]:
         """Return the first message to a page; it offers only what this announces."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
-                "badge": self.badge,
-                "system": one_line(self.context.run.system.name),
-                "expires": self._expires(), "tables": self._state.picture.tables,
-                "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
+                "badge": self.badge, "system": one_line(self.context.run.system.name),
+                "expires": self._expires(), "panels": _PANELS.fit(self._panels)[0],
+                "past": self._state.past()}
 
     def _expires(self) -> tuple[str, float] | None:
         """Return the certificate of the run that expires first, and the time (Unix time)."""
@@ -292,6 +290,7 @@ class Hmi(Actor):
             Handlers,
             PageServer,
         )
+        from rampart.actors.web.door import Gate  # noqa: PLC0415 likewise
 
         page, complain = self.context.run.plan.page, self._complain
         if page.cert:

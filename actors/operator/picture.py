@@ -1,6 +1,6 @@
 """The contents of pages, in parts that know when they last changed. Pure.
 
-Each change gives the picture a new version. A page at version *v* receives the sections, rows and
+Each change gives the picture a new version. A page at version *v* receives the sections and log
 lines that changed since *v*; a new page (version 0) receives everything. So nothing has to be kept
 for a page that was suspended or too slow: it receives the newest contents and no backlog.
 
@@ -70,42 +70,8 @@ class Journal:
         return [msgspec.Raw(encoded) for added, encoded in self._lines if added > version]
 
 
-class Table:
-    """Rows by name, each with the version of its last change. A deleted row is None.
-
-    Args:
-        rows: most rows; further names are ignored.
-    """
-
-    __slots__ = ("_most", "_rows", "version")
-
-    def __init__(self, rows: int) -> None:
-        self._most = rows
-        self._rows: dict[str, tuple[int, Any, msgspec.Raw]] = {}
-        self.version = 0
-
-    def set(self, name: str, row: Any, version: int) -> bool:
-        """Set a row, or delete it by None; return False without a change or without room."""
-        before = self._rows.get(name)
-        if (row is None if before is None else before[1] == row) or (
-                before is None and len(self._rows) >= self._most):
-            return False
-        self._rows[name] = (version, row, msgspec.Raw(_JSON.encode(LINE.fit(row)[0])))
-        self.version = version
-        return True
-
-    def rows(self) -> dict[str, Any]:
-        """Return all rows."""
-        return {name: row for name, (_, row, _) in self._rows.items() if row is not None}
-
-    def since(self, version: int) -> dict[str, msgspec.Raw]:
-        """Return the rows that changed after a version as JSON; since 0, all that exist."""
-        return {name: encoded for name, (changed, row, encoded) in self._rows.items()
-                if changed > version and not (version == 0 and row is None)}
-
-
 class Picture:
-    """All sections, tables and journals by name, and the version of the whole.
+    """All sections and journals by name, and the version of the whole.
 
     Attributes:
         version: grows with each change.
@@ -116,19 +82,12 @@ class Picture:
         self.version = 1  # a new page is at 0
         self.on_change: Callable[[], None] = lambda: None
         self._sections: dict[str, Section] = {}
-        self._tables: dict[str, Table] = {}
         self._journals: dict[str, Journal] = {}
-        self._left_out: dict[str, int] = {}
-        self._left_out_version = 0
 
     def section(self, name: str, value: Any = None, show: Callable[[Any], Any] = lambda v: v,
                 bounds: Bounds = SHOWN) -> None:
         """Declare a section with its first value, a conversion for pages, and bounds."""
         self._sections[name] = Section(value, show, bounds)
-
-    def table(self, name: str, rows: int) -> None:
-        """Declare a table with a greatest number of rows."""
-        self._tables[name] = Table(rows)
 
     def journal(self, name: str) -> None:
         """Declare a journal."""
@@ -147,21 +106,6 @@ class Picture:
         self.version = section.version = self.version + 1
         self.on_change()
 
-    def rows(self, name: str) -> dict[str, Any]:
-        """Return the rows of a table."""
-        return self._tables[name].rows()
-
-    @property
-    def tables(self) -> tuple[str, ...]:
-        """Names of the tables, which are sent row by row."""
-        return tuple(self._tables)
-
-    def put_row(self, name: str, row: str, value: Any) -> None:
-        """Set a row of a table, or delete it by None; the same value again is no change."""
-        if self._tables[name].set(row, value, self.version + 1):
-            self.version += 1
-            self.on_change()
-
     def add(self, name: str, line: Any) -> None:
         """Add a line to a journal."""
         self.version += 1
@@ -171,16 +115,11 @@ class Picture:
     def changes(self, since: int) -> dict[str, Any]:
         """Return the parts that changed after a version as JSON; since 0, everything.
 
-        `left_out` has the number of missing entries by section, if that has changed too.
+        `left_out` has the number of missing entries by section.
         """
-        parts: dict[str, Section | Table | Journal] = {
-            **self._sections, **self._tables, **self._journals}
+        parts: dict[str, Section | Journal] = {**self._sections, **self._journals}
         changed: dict[str, Any] = {name: part.since(since) for name, part in parts.items()
                                    if since == 0 or part.version > since}
-        left_out = {n: section.left_out for n, section in self._sections.items()
-                    if section.left_out}
-        if left_out != self._left_out:  # known only now that the sections are encoded
-            self._left_out, self._left_out_version = left_out, self.version
-        if self._left_out_version > since:
-            changed["left_out"] = left_out
+        changed["left_out"] = {name: section.left_out for name, section in self._sections.items()
+                               if section.left_out}  # known now that the sections are encoded
         return changed

@@ -32,8 +32,7 @@ from rampart.actors.operator.requests import (
 )
 from rampart.actors.web.access import SUBPROTOCOL, Access
 from rampart.actors.web.audit import AuditLog
-from rampart.actors.web.door import Door, address_of, login_routes, visitor_of
-from rampart.actors.web.gate import Gate
+from rampart.actors.web.door import Door, Gate, address_of, login_routes, visitor_of
 from rampart.actors.web.listening import listen
 from rampart.actors.web.server import WebServer
 from rampart.actors.web.tls import Tls

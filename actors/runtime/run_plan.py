@@ -13,7 +13,7 @@ import msgspec
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.ftm.messages import NamedFault
-from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.access import PagePlan
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.schema import SystemSpec

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 
-from rampart.actors.web.tcp_peer import plain_address
+from rampart.actors.web.access import plain_address
 from rampart.actors.web.token_file import SecretError, file_state, read_private
 
 _MAX_BYTES = 1_000_000

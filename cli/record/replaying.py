@@ -47,7 +47,7 @@ from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.members import load_class
-from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.access import PagePlan
 from rampart.cli.output import UsageError
 from rampart.cli.session import pause
 from rampart.manager.spec.schema import Kind

@@ -1,11 +1,11 @@
 """The files with which a run can be resumed, and how they are found.
 
 The report's directory holds a manifest (`run.json`: the run's id, its arguments, and digests of its
-input files), the nodes' checkpoints, and the last two copies of the run's record. Every process of
-the run locks the directory (flock(2)). So a locked run lives, even if its launcher has died.
+input files), the nodes' checkpoints, and a copy of the run's record. Every process of the run locks
+the directory (flock(2)). So a locked run lives, even if its launcher has died.
 
 A resumed run has the same run id and the next part number. Its simulated time continues a little
-after the newest record, so that no state is from the future.
+after the record, so that no state is from the future.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PATIENCE_S = 3.0
 """Real seconds in which the processes of a run end after their launcher was killed."""
 
 AFTER_S = 2.0 + STARTUP_S[1]
-"""Real seconds from the newest copy of the record to the beginning of the next part. A copy is made
+"""Real seconds from the copy of the record to the beginning of the next part. A copy is made
 each second, checkpoints may be newer, and the processes start before the part begins.
 """
 
@@ -173,54 +173,46 @@ class RunFiles:
             replace_file(self.directory / MANIFEST, saved)
 
     def end(self, manifest: Manifest) -> None:
-        """Write the manifest of a run that has ended, and remove the copies of its record.
+        """Write the manifest of a run that has ended, and remove the copy of its record.
 
         Raises:
             ResumptionError: The manifest cannot be written.
-            OSError: A copy cannot be removed.
+            OSError: The copy cannot be removed.
         """
         self.save(manifest)
-        for file in self._memories(manifest.run_id):
-            file.unlink(missing_ok=True)
+        self._memory(manifest.run_id).unlink(missing_ok=True)
 
     def keep_memory(self, run_id: str, memory: bytes) -> None:
-        """Write a copy of a run's record, and keep the one before it.
+        """Replace the copy of a run's record.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: It cannot be written; the one before stays.
         """
-        newest, before = self._memories(run_id)
-        with contextlib.suppress(FileNotFoundError):
-            newest.replace(before)
-        replace_file(newest, hashlib.sha256(memory).digest() + memory)
+        replace_file(self._memory(run_id), hashlib.sha256(memory).digest() + memory)
 
-    def recall(self, run_id: str, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
-        """Load the newest undamaged copy of a run's record.
+    def recall(self, run_id: str, recall: Callable[[bytes], float]) -> tuple[float, str]:
+        """Load the copy of a run's record.
 
         Args:
             run_id: Name of the run.
             recall: Takes the copy and returns its time, simulated seconds.
 
         Returns:
-            That time, 0 without a copy; and one line per damaged copy.
+            That time, 0 without a copy; and why a copy could not be loaded, "" if it could.
         """
-        problems: list[str] = []
-        for file in self._memories(run_id):
-            try:
-                data = _content(file)
-                if hashlib.sha256(data[32:]).digest() != data[:32]:
-                    raise msgspec.DecodeError("its checksum is wrong")
-                return recall(data[32:]), problems
-            except FileNotFoundError:
-                continue
-            except (OSError, msgspec.DecodeError) as error:
-                problems.append(f"{file}: damaged: {error}")
-        return 0.0, problems
+        file = self._memory(run_id)
+        try:
+            data = _content(file)
+            if hashlib.sha256(data[32:]).digest() != data[:32]:
+                raise msgspec.DecodeError("its checksum is wrong")
+            return recall(data[32:]), ""
+        except FileNotFoundError:
+            return 0.0, ""
+        except (OSError, msgspec.DecodeError) as error:
+            return 0.0, f"{file}: damaged: {error}"
 
-    def _memories(self, run_id: str) -> tuple[Path, Path]:
-        """Return the files of the newest copy and of the one before it."""
-        name = f"record-{run_id}.memory"
-        return self.directory / name, self.directory / f"{name}.before"
+    def _memory(self, run_id: str) -> Path:
+        return self.directory / f"record-{run_id}.memory"
 
 
 def find(reports: Path, which: str) -> tuple[RunFiles, Manifest]:

@@ -21,7 +21,7 @@ import msgspec
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.system.layout import Layout
-from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.access import PagePlan
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.judge import Verdict

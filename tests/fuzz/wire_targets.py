@@ -25,7 +25,7 @@ from rampart.actors.recording.message_form import Forms
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title
 from rampart.actors.web.access import Access
-from rampart.actors.web.gate import Gate
+from rampart.actors.web.door import Gate
 from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, parse
 from rampart.manager.actor import MANAGER_STATE
 from tests.fuzz.message_extremes import sample

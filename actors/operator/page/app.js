@@ -25,7 +25,6 @@ let picture = {};            // latest value of each section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not drawn yet
 const changed = new Set();   // sections that are not drawn yet
 let frame = 0;
-let tables = [];             // sections that arrive row by row, with null for a deleted row
 let ready = false;           // whether the panels of this connection exist
 let tooMuch = {};            // number of missing entries at the start of the connection
 let introduction = null;     // the HMI's offer to this page: it comes before the panels exist
@@ -108,7 +107,6 @@ function take(message) {
   link(badge === "live" ? "good" : "warn", badge);
   for (const [name, value] of Object.entries(message)) {
     if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LINES);
-    else if (tables.includes(name)) picture[name] = merged(picture[name], value);
     else picture[name] = value;
     changed.add(name);
   }
@@ -121,10 +119,6 @@ function soon() {
   if (!ready) return;
   if (document.hidden) seen();
   else if (!frame) frame = requestAnimationFrame(draw);
-}
-
-function merged(rows, news) {
-  return new Map([...(rows || []), ...Object.entries(news)].filter(([name]) => news[name] !== null));
 }
 
 function draw() {
@@ -157,7 +151,6 @@ async function hello(message) {
   const from = socket;
   retryMs = 500;
   badge = message.badge;
-  tables = message.tables;
   picture = {};
   fresh = { decisions: [], events: [] };
   changed.clear();

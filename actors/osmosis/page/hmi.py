@@ -412,7 +412,7 @@ class OsmosisHmi(Hmi):
 
     @on(topics.LIGHT_MEASURED)
     def _light(self, message: m.LightMeasurement, _header: Header) -> None:
-        self._state.light(message)
+        self._state.lights((message,))
 
 
 def _goals(mission: Mission) -> tuple[m.Goal, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ TRACK_STEP_M = 0.25
 TRACK_POINTS = 4000
 
 _ROUTE = Bounds(items=1000)
+_LIGHTS = Bounds(items=MAX_LIGHTS)
 
 
 class OsmosisState(HmiState):
@@ -51,7 +52,7 @@ class OsmosisState(HmiState):
         self.aged("mission", show=_mission)
         self.picture.section("route", (), _route, _ROUTE)
         self.picture.section("obstacles", ())
-        self.picture.table("lights", MAX_LIGHTS)
+        self.picture.section("lights", {}, bounds=_LIGHTS)
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Keep the pose, and a point of the track if the robot has moved."""
@@ -77,19 +78,20 @@ class OsmosisState(HmiState):
         """Keep the mission's state; a new mission starts with unmeasured lights."""
         if status.mission_id and status.mission_id != self._mission_id:
             self._mission_id = status.mission_id
-            for name in self.picture.rows("lights"):
-                self.picture.put_row("lights", name, None)
+            self.picture.put("lights", {})
         self.keep("mission", status, now_s)
-        for light in status.lights:
-            self.light(light)
+        self.lights(status.lights)
 
-    def light(self, measured: m.LightMeasurement) -> None:
-        """Keep the measurement of a light on the map."""
-        name = measured.light
-        if len(name) <= MAX_NAME and (self._lights is None or name in self._lights):
-            self.picture.put_row("lights", name, {
-                "verdict": measured.verdict, "ratio": round(measured.ratio, 3),
-                "intensity_cd": round(measured.intensity_cd, 1)})
+    def lights(self, measured: Iterable[m.LightMeasurement]) -> None:
+        """Keep the measurements of lights on the map."""
+        rows = dict(self.picture.value("lights"))
+        for each in measured:
+            name = each.light
+            is_shown = name in rows or (len(rows) < MAX_LIGHTS and len(name) <= MAX_NAME)
+            if is_shown and (self._lights is None or name in self._lights):
+                rows[name] = {"verdict": each.verdict, "ratio": round(each.ratio, 3),
+                              "intensity_cd": round(each.intensity_cd, 1)}
+        self.picture.put("lights", rows)
 
 
 def _with_time(heard: Heard | None) -> dict[str, Any] | None:

@@ -33,7 +33,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import load_application
-from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.access import PagePlan
 from rampart.systems import DEFAULT
 from rampart.testing import eventually
 from rampart.testing.ports import free_port

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import socket
 
 import httpx
@@ -130,19 +129,6 @@ async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_
     assert state["order"]["text"] == "pause refused: a reason"
     assert state["events"][-1]["text"] == "order to the mission: pause refused: a reason"
     assert {o.order for o in world.others.orders} == {order.order}
-
-
-async def test_a_page_that_reports_what_it_has_drawn_gets_no_backlog(world, page):
-    await hear(page, "state")
-    await page.send('{"type":"seen","version":0}')
-    async with repeated(world.others.sweep):
-        await asyncio.sleep(0.5)  # time for a dozen frames
-    frames = 0
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(0.2):
-            while await page.recv():
-                frames += 1
-    assert frames <= hmi_feed.IN_FLIGHT + 1
 
 
 async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch):

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from rampart.actors.web import server as web_server
-from rampart.actors.web.tcp_peer import user_of_peer
+from rampart.actors.web.door import user_of_peer
 from rampart.testing import eventually
 from tests.actors.operator.test_operating import Hand
 from tests.actors.operator.world import TOKEN, open_page, served

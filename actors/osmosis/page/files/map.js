@@ -113,7 +113,7 @@ class AirportMap {
     for (const which of ["laser", "upper_laser"]) {
       if (changed.has(which)) this.showSweep(this.sweeps[which], picture[which]);
     }
-    if (changed.has("lights")) this.showLights(picture.lights);
+    if (changed.has("lights")) this.showLights(new Map(Object.entries(picture.lights)));
     if (changed.has("route")) this.route.setAttribute("points", points(picture.route));
     if (changed.has("obstacles")) this.showObstacles(picture.obstacles);
     if (changed.has("mission")) {

@@ -51,7 +51,7 @@ export default class Mission {
     this.memory.forget();
     this.lights = hello.map ? hello.map.lights.length : 0;
     this.choice.replaceChildren(...(hello.missions || []).map((name) => new Option(name, name)));
-    this.show({ lights: new Map() }, new Set(["mission", "lights"]));
+    this.show({ lights: {} }, new Set(["mission", "lights"]));
   }
 
   show(s, changed) {
@@ -105,7 +105,7 @@ export default class Mission {
 
   measured(rows) {
     const count = { ok: 0, dim: 0, out: 0 };
-    for (const light of rows.values()) count[light.verdict] += 1;
+    for (const light of Object.values(rows)) count[light.verdict] += 1;
     const all = count.ok + count.dim + count.out;
     say(this.count, all
       ? `${all} of ${this.lights} lights measured: ${count.ok} ok, ${count.dim} dim, ${count.out} out`

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from itsdangerous import TimestampSigner
 
-from rampart.actors.web.gate import LASTS_S, Gate
+from rampart.actors.web.door import LASTS_S, Gate
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 
 TOKEN = "secret-of-the-hangar-7"
