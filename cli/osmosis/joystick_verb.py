@@ -1,4 +1,4 @@
-"""`rampart joystick`: drive from the terminal's keyboard, or with a joystick of this machine."""
+"""`rampart joystick`: drive from the terminal's keyboard."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.detection.finding import Lasting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.teleoperation.joystick_device import AUTO, JoystickDevice
-from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.messages import Joystick
-from rampart.actors.runtime.parameters import read_parameters
-from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.lines import pilot_in_words
 from rampart.cli.osmosis.mission_verb import checked_reason
@@ -49,13 +45,11 @@ def add(verbs: Any, _formatter: Any, _common: Any) -> None:
              number("--speed", "SHARE", "initial share of full speed, 0.1 to 1 (default: 0.5)",
                     0.5),
              option("--way-out", metavar="REASON",
-                    help="drive the robot out of a prohibited area, for this reason"),
-             option("--device", nargs="?", const=AUTO, metavar="DEVICE",
-                    help="use a joystick instead of the keyboard (without DEVICE: the first one)"))
+                    help="drive the robot out of a prohibited area, for this reason"))
 
 
 async def joystick(options: argparse.Namespace) -> int:
-    """Drive by hand until the user, the run or the joystick ends it.
+    """Drive by hand until the user or the run ends it.
 
     Drive the robot with the arrow keys, or with u i o j l m , . as in ROS. Space
     or k releases, + and - change the speed, q or Ctrl-C quits.
@@ -63,7 +57,7 @@ async def joystick(options: argparse.Namespace) -> int:
     Hold the key to drive. A terminal does not report the release of a key, so the
     robot stops within 0.6 s after the last repetition. If it stops once after the
     first moment, shorten the repeat delay of the keyboard (X11: xset r rate 250).
-    With a joystick, hold its dead-man button.
+    The operator's page takes a gamepad.
 
     The robot obeys one joystick at a time: the first that is held. The others get
     a notice.
@@ -76,33 +70,26 @@ async def joystick(options: argparse.Namespace) -> int:
     Examples:
       rampart joystick
       rampart joystick --speed 0.2
-      rampart joystick --device                 # the first joystick of this machine
-      rampart joystick --device /dev/input/js1
       rampart joystick --way-out "localization was wrong, the grass is dry"
 
     exit code: 0 driven, 1 no effect, way out refused, or the robot is not out
     """
     between("--speed", options.speed, 0.1, 1)
-    if options.device is None and not sys.stdin.isatty():
-        raise UsageError("standard input: expected a terminal to read keys from, or --device for a "
-                         "joystick")
+    if not sys.stdin.isatty():
+        raise UsageError("standard input: expected a terminal to read keys from")
     reason = checked_reason(options.way_out, "--way-out") if options.way_out is not None else ""
     stop = asyncio.Event()
     async with connect(options.port) as session:
         if reason:
             way_out = _WayOut(session, reason, stop)
             await way_out.ask()
-        drive = _Drive(session, None if options.device else KeyboardStick(options.speed), stop)
-        device = _open(options.device, session, drive) if options.device else None
+        drive = _Drive(session, KeyboardStick(options.speed), stop)
         with stopped_by_signals(stop):
-            say("hold a key to drive, q quits" if device is None
-                else f"hold the dead-man button of {device.path} to drive, q quits")
+            say("hold a key to drive, q quits")
             try:
                 with keys(drive.press):
                     await drive.until_stopped()
             finally:
-                if device is not None:
-                    device.close()
                 await drive.let_go()
                 say()
         if drive.ended:
@@ -158,25 +145,12 @@ class _WayOut:
                 self._stop.set()
 
 
-def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
-    spec = systems.load(session.run.system_file)
-    actor = f"{Teleoperation.__module__}:{Teleoperation.__name__}"
-    parameters = next((n.parameters for n in spec.nodes if n.actor == actor), {})
-    mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
-                              "teleoperation")
-    device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)
-    missing = device.open()
-    if missing:
-        raise UsageError(f"--device {name}: {missing}")
-    return device
-
-
 class _Drive:
-    """The user's joystick or keyboard, and the reaction of the robot.
+    """The user's keyboard, and the reaction of the robot.
 
     Args:
         session: the connection to the run.
-        keyboard: turns keys into positions; None for a device.
+        keyboard: turns keys into positions.
         stop: set to end.
 
     Attributes:
@@ -185,13 +159,11 @@ class _Drive:
         answered: whether teleoperation ever obeyed or refused it.
     """
 
-    def __init__(self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
-                 ) -> None:
+    def __init__(self, session: Session, keyboard: KeyboardStick, stop: asyncio.Event) -> None:
         self.ended = ""
         self.answered = False
         self._session = session
         self._keyboard = keyboard
-        self._device = m.Joystick(0.0, 0.0, False)
         self._stop = stop
         self._loop = asyncio.get_running_loop()
         self._held = Lasting(_ANSWER_S)
@@ -208,20 +180,9 @@ class _Drive:
         """Handle a key."""
         if key in {"q", "Q", END}:
             self._stop.set()
-        elif self._keyboard is not None:
+        else:
             self._keyboard.press(key, self._loop.time())
             self._send()
-
-    def moved(self, stick: m.Joystick) -> None:
-        """Handle a position of the device."""
-        self._device = stick
-        self._send()
-
-    def lost(self, why: str) -> None:
-        """Stop and end, because the device has vanished."""
-        self._device = m.Joystick(0.0, 0.0, False)
-        self.ended = f"the joystick vanished: {why}"
-        self._stop.set()
 
     async def until_stopped(self) -> None:
         """Publish the position while it is held, and show the state of the Safety Pilot."""
@@ -243,11 +204,8 @@ class _Drive:
             self._session.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
             await asyncio.sleep(_SHORTEST_S)
 
-    def _stick(self) -> m.Joystick:
-        return self._keyboard.stick(self._loop.time()) if self._keyboard else self._device
-
     def _send(self) -> None:
-        stick = self._stick()
+        stick = self._keyboard.stick(self._loop.time())
         if stick.dead_man:
             self.tried = self._held.note(True, self._loop.time()) or self.tried
             self._releases = _RELEASES
@@ -258,11 +216,10 @@ class _Drive:
             self._session.publish(topics.JOYSTICK, stick)
 
     def _show(self) -> None:
-        stick, pilot = self._stick(), self._pilot.value
+        stick, pilot = self._keyboard.stick(self._loop.time()), self._pilot.value
         text = (f"forward {stick.forward:+.0%} left {stick.left:+.0%}" if stick.dead_man
                 else "let go")
-        if self._keyboard is not None:
-            text += f"  speed {self._keyboard.speed:.0%}"
+        text += f"  speed {self._keyboard.speed:.0%}"
         if pilot is not None:
             text += f"  pilot {pilot_in_words(pilot, self._base.value)}"
         sys.stdout.write(f"\r{printable(text)[:78]:<78}")

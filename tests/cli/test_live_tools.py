@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import math
-import os
 import re
 import struct
 import subprocess
@@ -18,7 +17,6 @@ import pytest
 import websockets
 from prometheus_client import parser
 
-from rampart.actors.osmosis.control.teleoperation.joystick_device import AXIS, BUTTON, EVENT
 from rampart.cli.main import main
 from rampart.testing import RealRun
 from tests import ROOT
@@ -32,7 +30,6 @@ UP, LEFT = "\x1b[A", "\x1b[D"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
-    os.mkfifo(directory / "stick")
     with RealRun(directory, "paper") as it:
         it.wait_for("mission AB running", 60)
         yield it
@@ -136,30 +133,28 @@ def test_a_held_key_drives_and_without_its_repetition_or_its_process_the_robot_s
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
 
 
-def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
-    fifo = run.directory / "stick"
+def test_who_holds_first_drives_and_the_other_is_told_who_has_the_stick(run):
     with echo(run, "teleoperation/command") as heard, \
-            PseudoTerminal("joystick", "--port", str(run.port), "--device", str(fifo)) as driver, \
+            PseudoTerminal("joystick", "--port", str(run.port)) as driver, \
             PseudoTerminal("joystick", "--port", str(run.port)) as it:
-        it.wait_for("hold a key")
-        driver.wait_for("hold the dead-man button")
-        device = os.open(fifo, os.O_WRONLY)
-        os.write(device, EVENT.pack(0, 1, BUTTON, 4) + EVENT.pack(0, 16384, AXIS, 0))
-        it.wait_for(lambda: len(heard()) > 5)
-        hold(it, UP, lambda: "has the stick" in it.text)
-        assert all(linear == 0.0 and turn < 0.0 for linear, turn in map(twist, heard()))
-        os.close(device)  # pulled out
-        driver.wait_for("the joystick vanished")
+        for terminal in (driver, it):
+            terminal.wait_for("hold a key")
+        hold(driver, LEFT, lambda: len(heard()) > 5)
+
+        def told() -> bool:
+            driver.press(LEFT)
+            return "has the stick" in it.text
+
+        hold(it, UP, told)
+        assert all(linear == 0.0 and turn >= 0.0 for linear, turn in map(twist, heard()))
         it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
         it.press("q")
         assert it.end() == 0
         assert it.is_as_before
 
 
-def test_the_keyboard_needs_a_terminal_and_a_joystick_its_device(run, refused):
+def test_the_keyboard_needs_a_terminal(run, refused):
     assert "expected a terminal" in refused("joystick", "--port", run.port)
-    missing = "/nonexistent/js0"
-    assert "No such file" in refused("joystick", "--port", run.port, "--device", missing)
 
 
 # -- metrics ------------------------------------------------------------------------------------

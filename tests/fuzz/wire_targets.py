@@ -14,12 +14,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.osmosis.control.planning.graph_planner import ROUTE_STATE
-from rampart.actors.osmosis.control.teleoperation.joystick_device import (
-    EVENT,
-    ForeignDeviceError,
-    StickDecoder,
-    StickMapping,
-)
 from rampart.actors.osmosis.page.hmi import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.runtime.checkpoint import StateError
@@ -87,18 +81,6 @@ def run_info(data: bytes) -> None:
 
 
 # -- operators -------------------------------------------------------------------------------------
-
-
-@target("joystick", refuses=(ForeignDeviceError,), samples=lambda: [
-        b"".join(EVENT.pack(5, *event) for event in (
-            (0, 0x82, 0), (0, 0x81, 4), (1, 0x01, 4), (-32767, 0x02, 1), (32767, 0x02, 0)))])
-def joystick(data: bytes) -> None:
-    decoder = StickDecoder(StickMapping())
-    for at in range(0, len(data), 13):
-        decoder.feed(data[at:at + 13])
-        stick = decoder.stick
-        if not (-1 <= stick.forward <= 1 and -1 <= stick.left <= 1):
-            raise AssertionError(f"beyond the end of the stick: {stick}")
 
 
 _FORMS = Forms(topics.ALL)

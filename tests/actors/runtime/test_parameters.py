@@ -81,9 +81,7 @@ def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
      "suspects = .*: expected osmosis_control and its standby"),
     ("detections", "DM12", {"pilot": 3}, "pilot = 3: expected the name of a node"),
     ("nodes", "mission_manager", {"held_by": ["RM99"]}, "held_by = .*unknown recovery module 'RM9"),
-    ("nodes", "teleoperation", {"left_axis": 256}, "left_axis = 256: .* 0 or more, at most 255"),
-    ("nodes", "teleoperation", {"left_axis": 1},
-     "left_axis = 1: expected another axis than forward_axis"),
+    ("nodes", "teleoperation", {"linear_mps": -1}, "linear_mps = -1: .* 0 or more"),
 ])
 def test_what_an_actor_does_not_take_is_refused_with_file_path_and_what_would_be_right(
         table, name, parameters, words):

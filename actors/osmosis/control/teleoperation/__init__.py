@@ -1,1 +1,1 @@
-"""Teleoperation by joystick or gamepad."""
+"""Teleoperation by joystick."""

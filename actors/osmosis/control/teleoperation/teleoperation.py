@@ -13,7 +13,6 @@ import msgspec
 
 from rampart.actors.operator.stick_arbitration import Ruling, StickArbiter
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.teleoperation.joystick_device import StickMapping
 from rampart.actors.osmosis.messages import Joystick, StickTwist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
@@ -42,8 +41,8 @@ def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
 class Teleoperation(Actor):
     """Converts each joystick position to a command at once. Sources repeat a held position."""
 
-    class Parameters(Actor.Parameters, StickMapping, frozen=True):
-        """Speeds, besides the mapping of a device, which `rampart joystick --device` uses.
+    class Parameters(Actor.Parameters, frozen=True):
+        """Speeds.
 
         Attributes:
             linear_mps: speed at full deflection; by default the robot's.

@@ -133,8 +133,3 @@ class Supervisor(Actor):
     def _say(self, message: fm.RespawnRequest, event: str, incarnation: int) -> None:
         self.publish(ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
             message.node, event, 1, incarnation, message.by, ""))
-
-
-def hang(actor: Actor) -> None:
-    """Stop an actor's loop like SIGSTOP: it stays announced, and is silent."""
-    actor.hold(True)
