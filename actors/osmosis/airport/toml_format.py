@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar
 
-import msgspec
 import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
@@ -26,26 +23,23 @@ from rampart.actors.osmosis.airport.model import (
 from rampart.files import toml
 from rampart.files.plain_text import shown
 from rampart.files.reading import read_text
+from rampart.manager.spec.reading import MisfitError, read
 
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
-_CHOICES = {"mode": model.GOAL_MODES, "kind": get_args(SurfaceKind),
-            "shape": get_args(model.ObstacleShape)}
-_KEY = re.compile(r"\[[^]]*\]|[^.[]+")
-_UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
-_TYPE_NAMES = {str: "str", int: "int", float: "float", bool: "bool", list: "array", dict: "object"}
+T = TypeVar("T")
 
 
 class _Surface(Record, frozen=True):
     name: Name
     kind: SurfaceKind
-    polygon: list[Point] | None = None
-    centre_line: list[Point] | None = None
+    polygon: tuple[Point, ...] | None = None
+    centre_line: tuple[Point, ...] | None = None
     half_width_m: float | None = None
 
 
 class _Area(Record, frozen=True):
     name: Name
-    polygon: list[Point]
+    polygon: tuple[Point, ...]
 
 
 class _Row(Record, frozen=True):
@@ -54,7 +48,7 @@ class _Row(Record, frozen=True):
     first: Point | None = None
     last: Point | None = None
     count: int | None = None
-    positions: list[Point] | None = None
+    positions: tuple[Point, ...] | None = None
 
 
 class _Mission(Record, frozen=True):
@@ -70,11 +64,11 @@ class _File(Record, frozen=True):
     start: model.StartPose
     nodes: dict[str, Point]
     edges: tuple[tuple[str, str], ...]
-    surface: list[_Surface]
+    surface: tuple[_Surface, ...]
     fillet_radius_m: float = 0.0
-    prohibited: list[_Area] = []
+    prohibited: tuple[_Area, ...] = ()
     building: tuple[model.Building, ...] = ()
-    row: list[_Row] = []
+    row: tuple[_Row, ...] = ()
     missions: dict[str, _Mission] = {}
     obstacle: tuple[model.ObstaclePreset, ...] = ()
     world: _World = _World()
@@ -119,60 +113,19 @@ def read_mission(path: Path) -> model.Mission:
     Raises:
         AirportError: as `read_airport`.
     """
-    mission: model.Mission = _convert(path, model.Mission)
-    return mission
+    return _convert(path, model.Mission)
 
 
-def _convert(path: Path, kind: Any) -> Any:
+def _convert(path: Path, kind: type[T]) -> T:
     with readable(path, "see https://toml.io"):
         table = toml.parse(read_text(path, model.MAX_FILE_BYTES), model.MAX_FILE_BYTES)
     _check_numbers(table, "", str(path))
     try:
-        return msgspec.convert(table, kind)
-    except msgspec.ValidationError as error:
-        message, _, where = str(error).partition(" - at ")
-        where = where.strip("`").removeprefix("$").lstrip(".")
-        remedy = message
-        choices = _CHOICES.get(where.rpartition(".")[2])
-        if choices and message.startswith("Invalid enum value"):
-            remedy = f"must be one of {', '.join(choices)}"
-        unknown = _UNKNOWN.fullmatch(message)
-        if unknown:
-            known = ", ".join(field.name for field in msgspec.structs.fields(kind))
-            remedy = "unknown field" + ("" if where else f"; known: {known}")
-            where = f"{where}.{unknown[1]}".lstrip(".")
-        where, value = _locate(table, where, message)
-        raise AirportError(f"{path}: {where}: {value}: {remedy}") from None
-
-
-def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
-    """Return path and value of an invalid field, the value as short text.
-
-    In msgspec's path `[...]` stands for any key of a table: the first key counts whose value or
-    type occurs in the message.
-    """
-    found = list(_resolve(table, "", _KEY.findall(path))) or [(path, table)]
-    fitting = [
-        (where, value) for where, value in found
-        if f"{value!r}" in message or f"got `{_TYPE_NAMES.get(type(value), '')}`" in message]
-    where, value = (fitting or found)[0]
-    return where.lstrip(".") or "file", shown(value)
-
-
-def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any]]:
-    """Yield each (path, value) that matches a path with wildcards; it may end beyond the data."""
-    key = keys[0] if keys else ""
-    index = key.strip("[]")
-    if key == "[...]" and isinstance(value, dict):
-        for name, part in value.items():
-            yield from _resolve(part, f"{where}.{name}", keys[1:])
-    elif key.startswith("[") and isinstance(value, list) and index.isdigit() \
-            and int(index) < len(value):  # an array under another key may be shorter
-        yield from _resolve(value[int(index)], where + key, keys[1:])
-    elif isinstance(value, dict) and key in value:
-        yield from _resolve(value[key], f"{where}.{key}", keys[1:])
-    elif not keys or key != "[...]":
-        yield where + "".join(f".{rest}" for rest in keys), value
+        return read(table, kind, "")
+    except MisfitError as error:
+        where, problem, value = error.finding
+        said = f"{shown(value[0])}: " if value else ""
+        raise AirportError(f"{path}: {where.lstrip('.') or 'file'}: {said}{problem}") from None
 
 
 def _check_numbers(value: Any, path: str, file: str) -> None:
@@ -190,7 +143,7 @@ def _check_numbers(value: Any, path: str, file: str) -> None:
             _check_numbers(part, f"{path}[{i}]", file)
 
 
-def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
+def _surfaces(parts: tuple[_Surface, ...], file: str) -> tuple[model.Surface, ...]:
     surfaces = []
     for i, part in enumerate(parts):
         where, half_m = f"surface[{i}]", part.half_width_m
@@ -210,7 +163,7 @@ def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
     return tuple(surfaces)
 
 
-def _polygon(points: list[Point], where: str, file: str) -> Any:
+def _polygon(points: tuple[Point, ...], where: str, file: str) -> Any:
     if len(points) < 3:
         raise _error(file, where, shown(points), "expected three or more points")
     shape = Polygon(points)
@@ -224,12 +177,13 @@ def _lights(row: _Row, i: int, file: str) -> list[model.Light]:
     spaced = row.first is not None and row.last is not None and row.count is not None
     if spaced == (row.positions is not None):
         raise _error(file, where, row.name, "expected either first, last and count, or positions")
-    points = row.positions or []
+    points = row.positions or ()
     if row.first is not None and row.last is not None and row.count is not None:
         if row.count < 2:
             raise _error(file, f"{where}.count", row.count, "expected two or more lights")
         (ax, ay), (bx, by), gaps = row.first, row.last, row.count - 1
-        points = [(ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count)]
+        points = tuple(
+            (ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count))
     return [model.Light(f"{row.name}{k:02d}", row.name, x_m, y_m, row.nominal_cd)
             for k, (x_m, y_m) in enumerate(points, start=1)]
 
