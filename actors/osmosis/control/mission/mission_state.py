@@ -6,8 +6,7 @@
     idle, succeeded, failed, cancelled → running (the next mission)
 
 A mission is paused by an order, by a recovery that holds the robot, or both, so the phase shows
-whether the robot may move. Orders that are not possible in a phase are refused with a reason; the
-table of transitions catches programming errors.
+whether the robot may move. Orders that are not possible in a phase are refused with a reason.
 
 The end of a hold continues what was under way before it, and starts nothing: a mission that is
 ordered during a hold waits for an order to resume, and an order to resume is refused.
@@ -36,15 +35,6 @@ from rampart.actors.runtime.checkpoint import StateFormat
 A = m.MissionAction
 P = m.MissionPhase
 
-TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
-    P.IDLE: frozenset({P.RUNNING, P.FAILED}),
-    P.RUNNING: frozenset({P.PAUSED, P.RETURNING, P.SUCCEEDED, P.FAILED, P.CANCELLED}),
-    P.PAUSED: frozenset({P.RUNNING, P.RETURNING, P.FAILED, P.CANCELLED}),
-    P.RETURNING: frozenset({P.PAUSED, P.FAILED, P.CANCELLED}),
-    **dict.fromkeys((P.SUCCEEDED, P.FAILED, P.CANCELLED), frozenset({P.RUNNING, P.FAILED})),
-}
-"""Phase → next phases. A new mission without goals fails at once."""
-
 ACTIVE = frozenset({P.RUNNING, P.PAUSED, P.RETURNING})
 """Phases in which a mission is under way."""
 
@@ -58,10 +48,6 @@ ANSWERS_KEPT = 32
 """Number of last orders that get the same answer if they are repeated."""
 
 _NO_GOAL = m.Goal(0.0, 0.0, m.Mode.TAXI)
-
-
-class IllegalTransitionError(ValueError):
-    """A transition that the table does not have; the message names both phases."""
 
 
 class MissionState(msgspec.Struct, frozen=True):
@@ -109,16 +95,7 @@ class MissionState(msgspec.Struct, frozen=True):
 
 
 def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> MissionState:
-    """Return the state in a new phase.
-
-    Raises:
-        IllegalTransitionError: the table does not have the transition.
-    """
-    if phase not in TRANSITIONS[state.phase]:
-        allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[state.phase]))
-        raise IllegalTransitionError(
-            f"mission {state.mission_id!r}: phase: {state.phase.value} → {phase.value}: expected "
-            f"one of {allowed}")
+    """Return the state in a new phase."""
     return replace(state, phase=phase, reason=reason)
 
 
@@ -136,12 +113,10 @@ def accept(state: MissionState, request: m.MissionRequest, now: float, *, first:
     """
     if request.mission_id in state.accepted:
         return state
-    before = replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state
-    started = enter(before, P.RUNNING) if request.goals else enter(
-        before, P.FAILED, "the mission has no goals")
     return _settle(MissionState(
-        request.mission_id, request.name, started.phase, request.goals, step_started_s=now,
-        reason=started.reason, accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
+        request.mission_id, request.name, P.RUNNING if request.goals else P.FAILED, request.goals,
+        step_started_s=now, reason="" if request.goals else "the mission has no goals",
+        accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
         held=state.held, answers=state.answers,
         paused="" if first or not state.held else "ordered during a stop: resume it"))
 
