@@ -16,7 +16,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rampart.actors.system.members import import_class
 from rampart.files.writing import replace_file
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
@@ -42,7 +41,6 @@ from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import (
     NONE,
     Moment,
-    RunPictures,
     environment,
     margin_text,
 )
@@ -104,8 +102,6 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
     texts = {run.job.key: condition.text for condition in found for run in condition.runs}
     pages = environment()
     pages.filters["breakable"] = _breakable
-    kind = import_class(trial.pictures, RunPictures, "pictures") if trial.pictures else RunPictures
-    pictures = kind([made.record for _, made in shown_runs])
     shown = {run.job.key for run, _ in shown_runs}
 
     def replay(key: str) -> str:
@@ -113,9 +109,8 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
 
     def shown_run(run: Run, made: VirtualResult) -> dict[str, Any]:
         chapter = story(run, made.record, made.judgement.narrowest_s)
-        picture = pictures.picture(made.record, run.job.key, run.job.text(), chapter["marks"])
         return {"condition": texts[run.job.key], "command": replay(run.job.key),
-                "margin": _margin(run.result.margin, trial), "picture": picture, **chapter}
+                "margin": _margin(run.result.margin, trial), **chapter}
 
     return pages.get_template("campaign/report.html").render(
         about=about, runs=runs, headline=headline(runs), in_common=in_common(runs),
@@ -123,7 +118,7 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
         sentence=about.section and about.section.sentence,
         summary=[(each, _summary(each, trial)) for each in found],
         every=_every_fault(found, trial), shown_at_once=SHOWN_AT_ONCE,
-        pictures=pictures, tracks=[shown_run(*each) for each in shown_runs], shown=shown,
+        tracks=[shown_run(*each) for each in shown_runs], shown=shown,
         failures=[(run.job.key, text) for run in runs for text in run.result.failures],
         replay=replay, margins=list(trial.margins.values()), exact_below=trial.exact_below,
         unit=trial.margin_unit, none=NONE)
@@ -302,7 +297,6 @@ def story(run: Run, record: RunRecord, narrowest_s: float | None) -> dict[str, A
         ("unsafe", "first unsafe", result.unsafe_s)) if at_s is not None]
     return {
         "key": run.job.key, "fault": run.job.text(), "run": run, "kind": kind_of(run.job),
-        "marks": marks,
         "moments": sorted([*marks, *(Moment(d.t_s, "", d.words)
                                      for d in record.decisions[:_DECISIONS])]),
         "more": max(0, len(record.decisions) - _DECISIONS),

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
-from markupsafe import Markup
 
 from rampart.files.writing import replace_file
 from rampart.sim.runs.record import Interval, RunRecord
@@ -183,36 +182,3 @@ class Moment(NamedTuple):
     at_s: float
     kind: str
     name: str
-
-
-class RunPictures:
-    """Draws nothing. A robot's trial names a derived class, see `Trial.pictures`.
-
-    Args:
-        records: Records of all runs.
-    """
-
-    style = Markup("")
-    """CSS of the pictures."""
-
-    words = ""
-    """Explanation for readers."""
-
-    def __init__(self, records: Sequence[Any]) -> None:
-        del records
-
-    def definitions(self) -> Markup:
-        """Return common parts of the pictures, such as a map, as HTML."""
-        return Markup("")
-
-    def picture(self, record: RunRecord, key: str, title: str, marks: Sequence[Moment]) -> Markup:
-        """Return the picture of a run as HTML.
-
-        Args:
-            record: Record of the run.
-            key: Makes ids in the page unique.
-            title: Title of the run.
-            marks: Events to mark.
-        """
-        del record, key, title, marks
-        return Markup("")

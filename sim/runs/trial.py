@@ -70,7 +70,6 @@ class Trial:
         exact_below: A margin from this value on may be a lower bound; None if all are exact.
         draws: Whether the report has curves of all numbers of the robot.
         resumes: Whether a resumed run continues the record of the part before.
-        pictures: Class path of the `RunPictures` in a campaign's report; "" for none.
         moments: First and last simulated time at which a campaign injects faults; None if they
             follow from the length of a run without faults.
 
@@ -98,7 +97,6 @@ class Trial:
     exact_below: ClassVar[float | None] = None
     draws: ClassVar[bool] = True
     resumes: ClassVar[bool] = True
-    pictures: ClassVar[str] = ""
     moments: ClassVar[tuple[float, float] | None] = None
 
     def __init__(self, run: RunContext, limit_s: float | None = None,

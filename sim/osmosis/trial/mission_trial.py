@@ -305,7 +305,6 @@ class MissionTrial(Trial):
     retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}
     margins = {"obstacle_m": "nearest obstacle", "prohibited_m": "nearest prohibited area"}
     exact_below = EXACT_BELOW_M
-    pictures = "rampart.sim.osmosis.trial.report:RunMaps"
     moments = 2.0, 120.0
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
