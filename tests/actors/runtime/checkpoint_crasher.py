@@ -79,11 +79,10 @@ def one(folder: Path, number: int, start: int) -> dict[str, object]:
 
 def main() -> None:
     directory, last, step = Path(sys.argv[1]), *map(int, sys.argv[2:4])
-    start = 1
     for index, number in enumerate(range(0, last, step)):
-        # Every death is survived by the same folder; every seventh meets an empty directory.
-        start = 1 if index % 7 == 0 else start + 2 * SAVES
-        print(json.dumps(one(directory / str(index // 7), number, start)), flush=True)
+        # Every death is survived by the same folder; every seventh meets an empty one.
+        folder = directory / str(index // 7)
+        print(json.dumps(one(folder, number, 1 + 2 * SAVES * index)), flush=True)
 
 
 if __name__ == "__main__":
