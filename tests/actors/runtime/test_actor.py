@@ -9,6 +9,7 @@ import math
 import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import ClassVar
 
 import pytest
@@ -274,24 +275,6 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     assert taken == {}
 
 
-async def test_the_heart_beats_at_the_period_that_the_system_states():
-    beats = []
-
-    class Noted(VirtualBus):
-        def post(self, key: str, payload: bytes) -> bool:
-            if key == bus_topics.HEARTBEAT.at("talker"):
-                beats.append(asyncio.get_running_loop().time())
-            return super().post(key, payload)
-
-    clock = Clock(asyncio.get_running_loop().time(), 100.0)
-    node = Talker(Context("talker", 1, clock, Noted(Hub(), "talker"), heartbeat_period_s=3.0))
-    task = asyncio.create_task(node.run())
-    await eventually(lambda: len(beats) >= 4)
-    node.stop()
-    await task
-    assert (beats[-1] - beats[0]) * 100.0 / (len(beats) - 1) == pytest.approx(3.0, rel=0.5)
-
-
 @pytest.mark.parametrize(("base", "name"), [
     (Actor, "clock"), (Actor, "publish"), (DetectionModule, "state"), (DetectionModule, "activate"),
     (RecoveryModule, "activated"), (RecoveryModule, "act")])
@@ -307,16 +290,9 @@ class Stopless(Actor):
         self.stop = False
 
 
-class Activateless(DetectionModule):
-    activate = 3
-
-
-@pytest.mark.parametrize(("cls", "words"), [
-    (Stopless, r"Stopless\.stop: Actor has a method of this name"),
-    (Activateless, r"Activateless\.activate: DetectionModule has a method")])
-async def test_an_attribute_that_hides_a_method_is_refused_before_the_node_works(cls, words):
-    node = cls(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
-    with pytest.raises(TypeError, match=words):
+async def test_an_attribute_that_hides_a_method_is_refused_before_the_node_works():
+    node = Stopless(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
+    with pytest.raises(TypeError, match=r"Stopless\.stop: Actor has a method of this name"):
         await node.run()
 
 
@@ -383,7 +359,7 @@ def count(sent, key):
 
 
 @within(postings)
-async def test_what_says_the_same_is_sent_once_a_second_and_read_with_each_heartbeat(given):
+async def test_what_says_the_same_is_sent_once_a_second_and_a_change_at_once(given):
     _system, reader, sent = given
     sent.clear()
     reader.levels.clear()
@@ -397,11 +373,6 @@ async def test_what_says_the_same_is_sent_once_a_second_and_read_with_each_heart
     assert max(reader.ages_s) == pytest.approx(0.0)  # it came when it was posted
     stamps = [stamp_s for _, _, stamp_s in reader.levels]
     assert stamps == sorted(set(stamps))  # each was taken once, by whatever way it came
-
-
-@within(postings)
-async def test_a_change_is_sent_at_once(given):
-    _system, reader, sent = given
     sent.clear()
     reader.levels.clear()
     Gauge.value = 2.0
@@ -409,6 +380,14 @@ async def test_a_change_is_sent_at_once(given):
     assert count(sent, "level") == 1
     changed = next((now_s, stamp_s) for now_s, value, stamp_s in reader.levels if value == 2.0)
     assert changed[0] == pytest.approx(changed[1])
+
+
+@within(VirtualSystem)
+async def test_the_heart_beats_at_the_period_that_the_system_states(system):
+    reader = system.start("reader", Reader)
+    system.start("gauge", lambda context: Gauge(replace(context, heartbeat_period_s=3.0)))
+    await asyncio.sleep(31.0)
+    assert reader.beats == pytest.approx(10, abs=1)
 
 
 @within(postings)
