@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Any
 
 import pytest
@@ -16,11 +15,12 @@ from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.recovery.respawn import Respawn, RespawnCore
 from rampart.actors.recovery.respawn_group import RespawnGroup
-from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem, run
 from tests import CELL
+from tests.actors.osmosis.recovery.world import Boss, Node, Supervisor
+from tests.osmosis_system import System
 from tests.virtual_time import within
 
 
@@ -76,8 +76,7 @@ async def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_repor
     await system.settle()
     system.say(HEARTBEAT, Heartbeat(1, 1, 0.06, 0, 0), "a", incarnation=3)
     await asyncio.sleep(0.18)
-    system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(True, 1, ("a",), ""), "manager",
-               member="RM")
+    Boss(system).order("RM", nodes=("a",))
     await system.settle()
     assert asked[-1].message.failed_incarnation == 3
     assert rm.activated
@@ -85,15 +84,15 @@ async def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_repor
 
 # what comes between the request for node a, whose life 3 died at 1 s, and the end
 STORIES = {
-    "respawned, then its heartbeat": (["started 4", "beat 4"], "back"),
-    "its heartbeat, then the answer": (["beat 4", "started 4"], "back"),
+    "respawned, then its heartbeat": (["respawned 4", "beat 4"], "back"),
+    "its heartbeat, then the answer": (["beat 4", "respawned 4"], "back"),
     "the answer is lost": (["beat 4"], "back"),
-    "a process is not enough": (["started 4", "born 4"], "pending"),
-    "a heartbeat of the dead life": (["started 4", "beat 3"], "pending"),
-    "a heartbeat that was under way": (["ghost 3"], "pending"),
-    "an answer about an old life that lives": (["started 3", "beat 3"], "pending"),
+    "a process is not enough": (["respawned 4", "adopted 4"], "pending"),
+    "a heartbeat of the dead life": (["respawned 4", "beat 3"], "pending"),
+    "a heartbeat that was under way": (["beat 3"], "pending"),
+    "an answer about an old life that lives": (["respawned 3", "beat 3"], "pending"),
     "the supervisor refuses": (["refused"], "failed"),
-    "the supervisor gives up": (["started 4", "died 4", "given up"], "failed"),
+    "the supervisor gives up": (["respawned 4", "crashed 4", "given up"], "failed"),
     "given up, and yet it comes": (["given up", "beat 4"], "back"),
     "events of no interest": (["running", "resumed"], "pending"),
 }
@@ -108,19 +107,12 @@ def test_a_node_counts_as_back_when_its_new_life_is_heard(events, end):
     for step, text in enumerate(events):
         now_s = 1.1 + step / 10
         word, _, number = text.partition(" ")
-        match word:
-            case "started":
-                rm.event("a", "respawned", int(number), "", now_s)
-            case "beat":
-                rm.beat("a", int(number), now_s if number != "3" else 1.04, now_s)
-            case "ghost":
-                rm.beat("a", 3, 1.04, now_s)
-            case "born":
-                rm.event("a", "adopted", int(number), "", now_s)
-            case "died":
-                rm.event("a", "crashed", int(number), "", now_s)
-            case _:
-                rm.event("a", text, 3, "", now_s)
+        if word == "beat":
+            rm.beat("a", int(number), now_s if number != "3" else 1.04, now_s)
+        elif number.isdigit():
+            rm.event("a", word, int(number), "", now_s)
+        else:
+            rm.event("a", text, 3, "", now_s)
     assert (rm.back == ("a",), rm.pending == ("a",), rm.problem != "") == (
         end == "back", end == "pending", end == "failed")
 
@@ -193,59 +185,20 @@ def test_what_was_given_up_is_tried_again_on_a_new_order_only():
 CHAIN = ["camera", "finder", "planner"]
 
 
-class Node(Actor):
-    """A node that does nothing but beat."""
-
-
-class FakeSupervisor(Actor):
-    """Respawns a requested node, if the running incarnation is the failed one."""
-
-    outputs = (topics.PROCESS_EVENT,)
-
-    def __init__(self, context: Context, system: VirtualSystem, broken: set[str]) -> None:
-        super().__init__(context)
-        self.system, self.broken = system, broken
-        self.done: list[tuple[str, int]] = []
-        self.asked: list[str] = []
-
-    @on(topics.RESPAWN)
-    def respawn(self, request: m.RespawnRequest, _header: Header) -> None:
-        """Do it, 100 ms later."""
-        node, now = request.node, self.system.incarnations[request.node]
-        self.asked.append(node)
-        if request.failed_incarnation < now or (node, now) in self.done:
-            return
-        self.done.append((node, now))
-        self.system.tasks[node].cancel()
-        del self.system.tasks[node]
-        if node not in self.broken:
-            self.call_later(0.1, lambda: self._start(node))
-
-    def _start(self, node: str) -> None:
-        self.system.start(node, Node)
-        self.publish(topics.PROCESS_EVENT, m.ProcessEvent(
-            node, "respawned", 1, self.system.incarnations[node], "R", ""))
-
-
 @asynccontextmanager
-async def played(broken: set[str] = frozenset(), **parameters: Any) -> AsyncIterator[Any]:
-    async with VirtualSystem() as system:
+async def played(**parameters: Any) -> AsyncIterator[tuple[System, Supervisor, Boss]]:
+    async with System() as system:
         for name in CHAIN:
             system.start(name, Node)
-        supervisor = system.start("supervisor", FakeSupervisor, system, broken)
-        reports = system.hear(topics.RECOVERY)
+        supervisor, boss = system.start("supervisor", Supervisor), Boss(system)
         system.start("R", RespawnGroup, nodes=CHAIN, **parameters)
         await asyncio.sleep(0.5)
-
-        def command(decision: int, *nodes: str, activate: bool = True) -> None:
-            system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(
-                activate, decision, nodes, "why"), "manager", member="R")
-
-        yield system, supervisor, command, reports
+        yield system, supervisor, boss
 
 
-def phase(reports: Any) -> str:
-    return reports[-1].message.phase.value
+def asked(supervisor: Supervisor) -> list[str]:
+    """The nodes that were asked for, each once."""
+    return list(dict.fromkeys(request.node for _, request in supervisor.requests))
 
 
 @pytest.mark.parametrize(("named", "others", "restarted"), [
@@ -257,49 +210,48 @@ def phase(reports: Any) -> str:
 ])
 def test_those_that_depend_on_it_go_with_it_in_order(named, others, restarted):
     async def scenario() -> None:
-        async with played(others=others) as (system, supervisor, command, reports):
+        async with played(others=others) as (system, supervisor, boss):
             for _ in range(20):  # the manager repeats what it wants
-                command(1, *(f"{name}#1" for name in named))
+                boss.order("R", nodes=tuple(f"{name}#1" for name in named))
                 await asyncio.sleep(0.05)
-            assert [node for node, _ in supervisor.done] == restarted
+            assert asked(supervisor) == restarted
             assert {name: system.incarnations[name] for name in CHAIN} == {
                 name: 2 if name in restarted else 1 for name in CHAIN}
-            assert list(dict.fromkeys(supervisor.asked)) == restarted
-            assert phase(reports) == "done"
+            assert boss.phases[-1] == "done"
 
     run(scenario)
 
 
-@within(partial(played, broken={"finder"}))
+@within(played)
 async def test_one_that_does_not_come_back_fails_it_and_those_after_it_are_left_alone(given):
-    system, supervisor, command, reports = given
-    command(1, "camera#1")
+    system, supervisor, boss = given
+    boss.order("R", nodes=("camera#1",))
+    await asyncio.sleep(0.5 * supervisor.delay_s)
+    supervisor.delay_s = 60.0  # from the next one on
     await asyncio.sleep(3.0)
-    assert [node for node, _ in supervisor.done] == ["camera", "finder"]
-    assert phase(reports) == "failed"
+    assert asked(supervisor) == ["camera", "finder"]
+    assert boss.phases[-1] == "failed"
     assert system.incarnations["planner"] == 1
-    assert "finder, planner" in reports[-1].message.reason
+    assert "finder, planner" in boss.reports[-1].message.reason
 
 
 @within(played)
 async def test_a_new_order_restarts_them_again_and_a_release_ends_it(given):
-    system, _, command, reports = given
-    command(1, "finder#1")
-    await asyncio.sleep(1.0)
-    assert phase(reports) == "done"
-    command(2, "finder#2")
-    await asyncio.sleep(1.0)
-    assert (phase(reports), system.incarnations["planner"]) == ("done", 3)
-    command(3, activate=False)
+    system, _, boss = given
+    for decision in (1, 2):
+        boss.order("R", decision, (f"finder#{decision}",))
+        await asyncio.sleep(1.0)
+        assert (boss.phases[-1], system.incarnations["planner"]) == ("done", decision + 1)
+    boss.release("R", 3)
     await asyncio.sleep(0.5)
-    assert phase(reports) == "idle"
+    assert boss.phases[-1] == "idle"
     assert system.incarnations == {**system.incarnations, "camera": 1, "finder": 3}
 
 
 @within(played)
 async def test_a_node_of_another_group_is_refused(given):
-    _, supervisor, command, reports = given
-    command(1, "gripper")
+    _, supervisor, boss = given
+    boss.order("R", nodes=("gripper",))
     await asyncio.sleep(0.3)
-    assert supervisor.done == []
-    assert "gripper: not among the nodes" in reports[-1].message.reason
+    assert supervisor.requests == []
+    assert "gripper: not among the nodes" in boss.reports[-1].message.reason
