@@ -293,10 +293,7 @@ def test_a_reset_that_is_refused_is_told_why():
 @pytest.mark.parametrize("between_s", [0.0, 4.0])
 @pytest.mark.parametrize("again", ["the manager", "the module", "the manager, after a standstill"])
 def test_a_latch_does_not_become_younger_when_somebody_is_started_again(again, between_s):
-    bench = Bench(edited(**EXCUSED))
-    bench.play("DM1; RM1 acting; RM1 done")
-    bench.idle("DM1")
-    bench.wait(10.0)
+    bench = Bench(edited(**EXCUSED)).play("DM1; RM1 acting; RM1 done; -DM1; wait 10")
     if again == "the manager":
         memory = msgspec.json.decode(msgspec.json.encode(
             remember(bench.state, bench.arbiter)), type=Memory)
@@ -306,18 +303,10 @@ def test_a_latch_does_not_become_younger_when_somebody_is_started_again(again, b
         for track in bench.state.recoveries:
             bench.report(track.name, DONE if track.name == "RM1" else IDLE)
     elif again == "the module":
-        bench.report("RM1", IDLE)
-        bench.report("RM1", DONE)
+        bench.play("RM1 idle; RM1 done")
     else:
         bench.state = forgive_absence(bench.state, 9.0, bench.now)
-    bench.wait(between_s)
-    assert bench.state.latched == ("RM1",)
-    bench.active("DM5")
-    bench.wait(1.0)
-    bench.idle("DM5")
-    bench.wait(10.0)
-    assert bench.state.latched == ("RM1",)
-    assert bench.orders == "RM1"
+    bench.play(f"wait {between_s}; latched: RM1; DM5; wait 1; -DM5; wait 10 = RM1; latched: RM1")
 
 
 def test_an_arbiter_that_takes_over_does_not_latch_what_was_excused():
@@ -329,10 +318,7 @@ def test_an_arbiter_that_takes_over_does_not_latch_what_was_excused():
         for dm in DMS:
             (after.active if dm == cause else after.idle)(dm)
         assert "RM1" in after.orders  # until all have been heard
-        for rm in ("RM2", "RM3", "RM4", "RM5"):
-            after.report(rm, IDLE)
-        after.report("RM1", DONE)
-        after.wait(1.0)
+        after.play("RM2 idle; RM3 idle; RM4 idle; RM5 idle; RM1 done; wait 1")
         assert after.state.latched == expected
         assert ("RM1" in after.orders) == bool(cause)
 
@@ -432,12 +418,7 @@ def test_a_number_that_was_never_given_is_not_counted_on_from():
 
 
 def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
-    spec = edited(RM2={"latched": True})
-    bench = Bench(spec)
-    bench.active("DM2")
-    bench.report("RM2", DONE)
-    bench.active("DM1")
-    assert bench.orders == "RM1"
+    bench = Bench(edited(RM2={"latched": True})).play("DM2; RM2 done; DM1 = RM1")
     memory = remember(bench.state, bench.arbiter)
     assert {latch.command.recovery for latch in memory.latches} == {"RM1", "RM2"}
     assert objection(memory) == ""
@@ -503,14 +484,3 @@ def test_the_short_way_leads_where_the_long_way_does(strategy, walk):
         with mock.patch.object(Arbiter, "_is_quiet", return_value=False):
             assert arbiter.step(state, event, now) == short
         state = short[0]
-
-
-def test_the_short_way_is_taken_while_all_is_well():
-    arbiter = build_arbiter(paper())
-    state = arbiter.initial(0.0)
-    for event in EVERYBODY:
-        state, _ = arbiter.step(state, event, 0.1)
-    with mock.patch.object(Arbiter, "_settle", side_effect=AssertionError("the long way")):
-        for event in EVERYBODY:
-            state, outputs = arbiter.step(state, event, 0.2)
-            assert outputs == ()
