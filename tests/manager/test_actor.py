@@ -18,7 +18,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.runtime.actor import Actor, Context, every
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_loop import VirtualLoop
@@ -143,19 +142,6 @@ async def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset(
 
 
 @within(whole)
-async def test_a_respawned_detection_module_does_not_let_go_of_a_fault_that_persists(system):
-    system.robot.silent.add("command")
-    await asyncio.sleep(2.0)
-    assert system.pilot.orders["RM2"].reason.startswith("DM2: command not updated")
-    await system.kill("DM2")
-    await asyncio.sleep(0.3)
-    system.start_node("DM2")
-    for _ in range(60):
-        await asyncio.sleep(0.05)
-        assert system.pilot.mode is PilotMode.STOP
-
-
-@within(whole)
 async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(system):
     system.supervisor.answer = "nothing"
     timeout_s = system.run.system.timing.detection_silence_timeout_s
@@ -174,16 +160,6 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
     await asyncio.sleep(2.0)
     assert [(r.request, r.node, r.failed_incarnation)
             for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
-
-
-@within(whole)
-async def test_a_detection_module_whose_reports_are_old_news_is_silent(system):
-    system.supervisor.answer = "nothing"
-    system.inject(ftm_topics.DETECTION, "freeze", 60.0, member="DM3")
-    await asyncio.sleep(0.5)
-    assert system.status.silent == ()
-    await asyncio.sleep(1.0)
-    assert system.status.silent == ("DM3",)
 
 
 @pytest.mark.parametrize("dies_too", [(), ("RM1",)], ids=["alone", "with RM1"])
