@@ -6,7 +6,6 @@ Nor does a forged later incarnation mute a recovery module, or a source of comma
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
 from functools import partial
 
 from rampart.actors.ftm import messages as fm
@@ -23,24 +22,35 @@ from tests.virtual_time import within
 FORGED = 999_999
 
 
-class World:
+class World(VirtualSystem):
     """One actor of the paper's system, its messages, and any sender."""
 
-    def __init__(self, system, name):
-        self.system = system
-        self.sent = system.overhear(name)
-        self.actor = system.start_node(name)
+    def __init__(self, name):
+        of = system("paper")
+        super().__init__(of.run, of.layout)
+        self.register = dict.fromkeys(of.layout.members, 1).get
+        self.name = name
 
-    async def tell(self, topic, body, source, incarnation=1, *, wait_s=0.05):
-        self.system.say(topic, body, source, incarnation=incarnation)
-        await asyncio.sleep(wait_s)
+    async def __aenter__(self):
+        await super().__aenter__()
+        self.sent = self.overhear(self.name)
+        self.actor = self.start_node(self.name)
+        await asyncio.sleep(0.1)
+        return self
+
+    async def tell(self, topic, body, source, incarnation=1):
+        self.say(topic, body, source, incarnation=incarnation)
+        await asyncio.sleep(0.05)
+
+    async def reset(self, holder):
+        await self.tell(ftm_topics.RESET, fm.Reset(holder, "operator"), "tool")
 
     def last(self, key):
         return [body for found, body in self.sent if found == key][-1]
 
     @property
     def holders(self):
-        return tuple(self.last(f"holds/{self.actor.name}")["holders"])
+        return tuple(self.last(f"holds/{self.name}")["holders"])
 
     @property
     def is_braked(self):
@@ -49,19 +59,7 @@ class World:
     @property
     def reports(self):
         return [(body["context"], body["offender"]) for key, body in self.sent
-                if key == f"diagnostic/{self.actor.name}"]
-
-
-@asynccontextmanager
-async def living(name):
-    """Let an actor of the paper's system live."""
-    of = system("paper")
-    async with VirtualSystem(of.run, of.layout) as virtual:
-        virtual.register = dict.fromkeys(of.layout.members, 1).get
-        world = World(virtual, name)
-        await asyncio.sleep(0.1)
-        yield world
-        await virtual.stop(name)
+                if key == f"diagnostic/{self.name}"]
 
 
 STOP = m.PilotOrder(True, PilotMode.STOP, "test")
@@ -71,31 +69,31 @@ BRAKE, LET_GO = (m.BrakeCommand(engaged, "test") for engaged in (True, False))
 # -- the base -----------------------------------------------------------------------------------
 
 
-@within(partial(living, "simulator"))
+@within(partial(World, "simulator"))
 async def test_an_unknown_holder_of_the_brake_is_obeyed_shown_and_can_be_made_to_let_go(world):
     await world.tell(topics.BRAKE, BRAKE, "nobody")
     assert world.is_braked
     assert world.holders == ("nobody",)
     assert ("brake", "nobody") in world.reports
-    told = len(world.sent)
+    world.sent.clear()
     await asyncio.sleep(0.5)
-    assert [key for key, _ in world.sent[told:]].count("holds/simulator") == 2
-    await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+    assert [key for key, _ in world.sent].count("holds/simulator") == 2
+    await world.reset("nobody")
     assert not world.is_braked
     assert world.holders == ()
-    told = len(world.sent)
+    world.sent.clear()
     await asyncio.sleep(0.5)
-    assert "holds/simulator" not in [key for key, _ in world.sent[told:]]
+    assert "holds/simulator" not in [key for key, _ in world.sent]
     await world.tell(topics.BRAKE, BRAKE, "nobody")
     await world.tell(topics.BRAKE, LET_GO, "nobody")
     assert (world.is_braked, world.holders) == (False, ())
 
 
-@within(partial(living, "simulator"))
+@within(partial(World, "simulator"))
 async def test_a_recovery_module_s_brake_is_its_own_to_release_whatever_anybody_forges(world):
     await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
     await world.tell(topics.BRAKE, BRAKE, "RM1")
-    await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
+    await world.reset("RM1")
     await world.tell(topics.BRAKE, LET_GO, "RM1", FORGED)
     assert world.is_braked
     assert not any(key.startswith("holds") for key, _ in world.sent)
@@ -106,13 +104,13 @@ async def test_a_recovery_module_s_brake_is_its_own_to_release_whatever_anybody_
 # -- the Safety Pilot ---------------------------------------------------------------------------
 
 
-@within(partial(living, "safety_pilot"))
+@within(partial(World, "safety_pilot"))
 async def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended(world):
     await world.tell(topics.PILOT_ORDER, STOP, "nobody")
     assert world.last("pilot/status")["mode"] == "stop"
     assert world.holders == ("nobody",)
     assert ("pilot order", "nobody") in world.reports
-    await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+    await world.reset("nobody")
     assert world.last("pilot/status")["mode"] == "auto"
     assert world.holders == ()
 

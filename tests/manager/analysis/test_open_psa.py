@@ -30,6 +30,10 @@ def events(*names: str) -> str:
     return "".join(f'<basic-event name="{name}"/>' for name in names)
 
 
+def declared(*names: str) -> str:
+    return "".join(f'<define-basic-event name="{name}"/>' for name in names)
+
+
 def cut_sets(text: str, top: str = "") -> set[frozenset[str]]:
     return {frozenset(s) for s in CutSets(read_open_psa(text, "f.xml", top)).sets()}
 
@@ -38,36 +42,34 @@ def sets(*texts: str) -> set[frozenset[str]]:
     return {frozenset(text.split()) for text in texts}
 
 
-@pytest.mark.parametrize(("body", "expected"), [
-    (f'<cardinality min="1" max="1">{events("a", "b")}</cardinality>', sets("a", "b")),
-    (f'<or>{events("a")}<constant value="true"/></or>', sets("")),
-    (f'<or>{events("a")}<constant value="false"/></or>', sets("a")),
-    ('<event name="a"/>', sets("a")),
-    ('<event name="a" type="basic-event"/>', sets("a")),
-])
-def test_a_count_a_constant_and_an_event_without_its_kind_have_their_meaning(body, expected):
-    assert cut_sets(mef(gate("top", body))) == expected
+PRIVATE = gate("g", f"<or>{events('e')}</or>", ' role="private"') + \
+    '<define-basic-event name="e" role="private"/>'
 
 
-def test_house_events_are_constants_wherever_they_are_defined():
-    text = mef(gate("top", '<and><house-event name="h"/><basic-event name="a"/></and>'),
-               data='<model-data><define-house-event name="h"><constant value="true"/>'
-                    "</define-house-event></model-data>")
-    assert cut_sets(text) == sets("a")
-
-
-def test_private_names_of_components_do_not_meet():
-    inner = gate("g", f"<or>{events('e')}</or>", ' role="private"') + \
-        '<define-basic-event name="e" role="private"/>'
-    text = mef(gate("top", '<and><gate name="left.g"/><gate name="right.g"/></and>'),
-               f'<define-component name="left">{inner}</define-component>',
-               f'<define-component name="right">{inner}</define-component>')
-    assert cut_sets(text) == sets("ft.left.e ft.right.e")
-
-
-def test_formulas_nested_by_the_thousand_are_read():
-    body = "<or>" * 4000 + events("a") + "</or>" * 4000
-    assert cut_sets(mef(gate("top", body))) == sets("a")
+@pytest.mark.parametrize(("text", "expected"), [
+    *((mef(gate("top", body)), expected) for body, expected in (
+        (f'<cardinality min="1" max="1">{events("a", "b")}</cardinality>', sets("a", "b")),
+        (f'<or>{events("a")}<constant value="true"/></or>', sets("")),
+        (f'<or>{events("a")}<constant value="false"/></or>', sets("a")),
+        ('<event name="a"/>', sets("a")),
+        ('<event name="a" type="basic-event"/>', sets("a")),
+        ("<or>" * 4000 + events("a") + "</or>" * 4000, sets("a")))),
+    # a house event is a constant wherever it is defined
+    (mef(gate("top", '<and><house-event name="h"/><basic-event name="a"/></and>'),
+         data='<model-data><define-house-event name="h"><constant value="true"/>'
+              "</define-house-event></model-data>"), sets("a")),
+    # private names of components do not meet
+    (mef(gate("top", '<and><gate name="left.g"/><gate name="right.g"/></and>'),
+         *(f'<define-component name="{side}">{PRIVATE}</define-component>'
+           for side in ("left", "right"))), sets("ft.left.e ft.right.e")),
+    # spaces around a name do not make it another one
+    (mef(gate("top", '<and><gate name="left "/><gate name="right"/></and>'),
+         gate("left", f"<or>{events('pump', 'v')}</or>"),
+         gate(" right", f"<or>{events(' pump ', 'w')}</or>"), declared("pump\t", "v", "w")),
+     sets("pump", "v w")),
+], ids=lambda part: str(part)[50:90])
+def test_what_may_be_written_has_its_meaning(text, expected):
+    assert cut_sets(text) == expected
 
 
 HOLDS = {
@@ -194,13 +196,8 @@ def test_the_top_may_be_chosen_and_the_line_of_a_mistake_is_told():
         cut_sets(mef("\n", gate("top", "\n<or>\n" + events("a") + '\n<gate name="g7"/></or>')))
 
 
-DECLARED = '<define-basic-event name="{}"/>'
 INCLUDE = ('<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="more.xml" '
            'xpointer="xpointer(/opsa-mef/*)"/>')
-
-
-def declared(*names: str) -> str:
-    return "".join(map(DECLARED.format, names))
 
 
 @pytest.mark.parametrize(("text", "where"), [
@@ -236,14 +233,6 @@ def test_what_is_not_understood_is_refused_and_not_skipped(text, where):
         read_open_psa(text, "f.xml")
     assert f"{where}: " in str(caught.value)
     assert str(caught.value).startswith("f.xml:1: ")
-
-
-def test_spaces_around_a_name_do_not_make_it_another_one():
-    left = gate("left", f"<or>{events('pump', 'v')}</or>")
-    right = gate(" right", f"<or>{events(' pump ', 'w')}</or>")
-    text = mef(gate("top", '<and><gate name="left "/><gate name="right"/></and>'), left, right,
-               declared("pump\t", "v", "w"))
-    assert cut_sets(text) == sets("pump", "v w")
 
 
 @pytest.mark.parametrize(("text", "words"), [
