@@ -1,4 +1,4 @@
-"""Two routers: a client connects to one and changes to the other when it dies."""
+"""The bus over Zenoh: a client connects to one router and changes to the other when it dies."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from rampart.actors.bus import zenoh_bus
 from rampart.actors.bus.board import FileBoard
 from rampart.actors.bus.bus import Bus, BusError, shared
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import endpoint, endpoints
+from rampart.actors.bus.zenoh_session import endpoint, endpoints, open_session
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.testing import eventually
 
@@ -291,3 +293,73 @@ async def test_a_flood_of_questions_is_answered_in_part(routers, sockets):
         answers = [ask(reader) for _ in range(3 * zenoh_bus._ANSWERS_PER_S)]
         await asyncio.sleep(0.5)
         assert 0 < sum(map(len, answers)) <= 2 * zenoh_bus._ANSWERS_PER_S
+
+
+# -- the bus over Zenoh: floods, errors of deliveries, and sessions that cannot be opened
+
+
+MANY = 1500
+
+
+async def test_a_flooded_reader_still_runs_its_timers(bus_folder):
+    reader = ZenohBus("reader", endpoints(bus_folder))
+    await reader.open()
+    heard, begun = [], asyncio.Event()
+
+    def slow(_key: str, payload: bytes) -> None:
+        heard.append(payload)
+        begun.set()
+        time.sleep(0.001)  # blocks the loop
+
+    reader.subscribe(ftm_topics.DETECTION.at("DM1"), slow)
+    with open_session(endpoints(bus_folder)) as member:
+        flood = member.declare_publisher(ftm_topics.DETECTION.at("DM1"),
+                                         congestion_control=zenoh.CongestionControl.BLOCK)
+
+        def say() -> None:
+            for _ in range(MANY):
+                flood.put(b"x")
+
+        await asyncio.sleep(0.1)  # the subscription is known
+        saying = asyncio.create_task(asyncio.to_thread(say))
+        await begun.wait()
+        turns = []
+        while len(heard) < MANY and len(turns) < 10_000:
+            turns.append(len(heard))
+            await asyncio.sleep(0.001)
+        await saying
+    await reader.close()
+    assert max(later - one for one, later in pairwise([*turns, MANY])) <= MANY / 2
+
+
+async def test_a_session_that_cannot_be_opened_reports_the_reason(monkeypatch):
+    def fail(*_: object) -> None:
+        raise zenoh.ZError("no memory left")
+
+    monkeypatch.setattr(zenoh, "open", fail)
+    with pytest.raises(BusError, match=r"\(node one\): no memory left"):
+        await ZenohBus("one", []).open()
+
+
+async def test_a_delivery_that_raises_keeps_no_other_message_back(bus_folder):
+    errors, received = [], []
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, told: errors.append(told))
+    reader, writer = (ZenohBus(name, endpoints(bus_folder)) for name in ("reader", "writer"))
+    await reader.open()
+    await writer.open()
+
+    def deliver(_key: str, payload: bytes) -> None:
+        received.append(payload)
+        time.sleep(0.1)  # the others arrive meanwhile
+        if payload == b"0":
+            raise ZeroDivisionError
+
+    key = ftm_topics.DETECTION.at("DM1")
+    reader.subscribe(key, deliver)
+    await asyncio.sleep(0.2)  # the subscription is known
+    for number in range(3):
+        writer.publish(ftm_topics.DETECTION, key, b"%d" % number)
+    await eventually(lambda: received == [b"0", b"1", b"2"])
+    assert len(errors) == 1
+    await reader.close()
+    await writer.close()
