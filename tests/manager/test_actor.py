@@ -22,7 +22,7 @@ from rampart.actors.runtime.actor import Actor, Context, every
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.detection.lane import LANE
-from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
+from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor
 from tests.osmosis_system import System, shipped_system
 from tests.virtual_time import within
 
@@ -146,7 +146,7 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
     system.supervisor.answer = "nothing"
     timeout_s = system.run.system.timing.detection_silence_timeout_s
     hung_s = system.clock.now()
-    hang(system.actors["DM3"])
+    system.actors["DM3"].hold(True)
     await asyncio.sleep(3.0)
     (at_s, request), = system.supervisor.requests
     assert 0.4 * timeout_s < at_s - hung_s < 0.75 * timeout_s
@@ -156,7 +156,7 @@ async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(s
     system.start_node("DM3")
     await asyncio.sleep(2.0)
     assert system.status.silent == ()
-    hang(system.actors["DM3"])
+    system.actors["DM3"].hold(True)
     await asyncio.sleep(2.0)
     assert [(r.request, r.node, r.failed_incarnation)
             for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]

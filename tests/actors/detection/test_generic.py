@@ -619,12 +619,6 @@ def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s
     assert core.nodes == ()
 
 
-@pytest.mark.parametrize("watch_list", ["a", [], [1], [""]])
-def test_a_watch_list_that_is_none_is_refused_by_name(watch_list):
-    with pytest.raises(ValueError, match=r"DM4: x\.watch.* = .*: expected a (list of node )?name"):
-        read_parameters(Watchdog.Parameters, {"watch": watch_list}, "DM4", "x")
-
-
 class Node(Actor):
     """A node that does nothing but beat."""
 

@@ -22,7 +22,7 @@ from rampart.manager.arbitration.arbiter import Arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
-from rampart.manager.spec.clearing import clearing_in_words, reset_role
+from rampart.manager.spec.clearing import reset_role
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
 from rampart.testing import VirtualSystem, run
@@ -125,16 +125,6 @@ def test_contradictions_are_refused_at_load(text, words):
     with pytest.raises(SpecificationError) as refused:
         parse_specification(text, "paper.toml")
     assert words in str(refused.value)
-
-
-def test_words_about_clearing():
-    words = clearing_in_words(edited(
-        FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject", "clear_after_s": 5.0},
-        FTM3={"clears": Clears.NEVER}))
-    assert [words[name] for name in ("FTM1", "RM1", "FTM2", "FTM3", "FTM4")] == [
-        *["clears by operator (role drive) once its error is gone"] * 2,
-        "clears by operator (role inject) once its error is gone for 5 s",
-        "never clears; only a new run ends it", "clears by itself once its error is gone"]
 
 
 def test_a_recovery_needs_the_highest_role_of_its_mechanisms():

@@ -56,12 +56,8 @@ STALE = 'gate = "or"\nof = ["control_node_crash", "non_control_node_crash"]'
 
 REFUSED = {
     "$: not valid TOML": [("[robot]", "[robot")],
-    "$.robot.length_m = 'long': expected a number > 0": [("length_m = 0.72", 'length_m = "long"')],
     "$.robot.widht_m = 0.614: unknown field; known:": [("width_m =", "widht_m =")],
-    "$.node[4]: required field 'name' is missing": [('name = "hmi"\n', "")],
     "$.timing.respawn_s = inf: expected a finite number": [("respawn_s = 0.4", "respawn_s = inf")],
-    "node hmi: kind = 'operator': expected one of control,": [
-        (HMI, HMI.replace("non-control", "operator"))],
     "node hmi: kind = 'supervision': unknown kind; known:": [
         (HMI, HMI.replace("non-control", "supervision"))],
     "node hmi: actor = 'rampart.actors.osmosis.page.hmi':": [
@@ -70,28 +66,16 @@ REFUSED = {
         ('title = "Runway light', '"ti`tle - at `$.robot" = "Runway light')],
     "= 'safety_pilot\\n': expected a name": [('name = "safety_pilot"', 'name = "safety_pilot\\n"')],
     "$: an integer with thousands of digits": [("width_m = 0.614", "width_m = " + "9" * 5000)],
-    "999...: 999999999 of 1 inputs; expected 1 to 1": [
-        ('detect = "DM3"', f'''detect = "{'9' * 5000} of (DM3)"''')],
-    "detection DM2: parameters.timeout_s = 1000": [
-        ('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
-    "detection DM5: parameters.watch[1] = 'telly': unknown": [
-        ('"hmi", "teleoperation"]', '"hmi", "telly"]')],
-    "$.order = 'braver': unknown order; known: safer": [('order = "safer" ', 'order = "braver" ')],
-    "event moving_inside_prohibited_area: of[0] =": [
-        (PROHIBITED, PROHIBITED.replace("erroneous_graph", "bad_luck"))],
     "$.robot.top_speed_mps = 1e+200: expected 0, or 1e-09 to": [
         ("top_speed_mps = 1.0", "top_speed_mps = 1e200")],
     "$: nested more than 32 deep": [("[layers]", f"[{'.'.join('a' * 50)}]")],
     "$.node[5].name = 'teleoperation': duplicate name,": [
         ('name = "hmi"', 'name = "teleoperation"')],
-    "$.node[4].name = 'supervisor': duplicate name, reserved": [
-        ('name = "hmi"', 'name = "supervisor"')],
     "node hmi: process = 'pool': reserved": [('name = "hmi"', 'name = "hmi"\nprocess = "pool"')],
     "$.event[2].name = 'erroneous_graph': duplicate name,": [
         ('name = "actuator_failure"', 'name = "erroneous_graph"'),
         (PROHIBITED, PROHIBITED.replace(', "actuator_failure"', ""))],
     "$.mechanism[1].name = 'and': expected a name that is": [('name = "FTM2"', 'name = "and"')],
-    "mechanism FTM3: detect = 'DM9': unknown detection": [('detect = "DM3"', 'detect = "DM9"')],
     "node hmi: respawn = 'RM8': unknown recovery module;": [(HMI, HMI.replace("RM4", "RM8"))],
     "detection DM2: parameters.timeout_s = 'soon': unknown": [
         ('timeout_s = "command_timeout_s"', 'timeout_s = "soon"')],
@@ -107,7 +91,6 @@ REFUSED = {
         ('kind = "manager"\nrespawn = "supervisor"', 'kind = "manager"\nrespawn = "RM4"')],
     "node ftm_manager: process = 'hmi': RM4 restarts hmi": [
         ('kind = "manager"', 'kind = "manager"\nprocess = "hmi"')],
-    "recovery RM4: process = 'hmi': RM4 restarts hmi, which": [(RM4, RM4 + '\nprocess = "hmi"')],
     "nodes[1] = 'safety_pilot': it shares the process of the": [
         ('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "ftm_manager"'),
         (RM4, RM4 + '\nparameters = { nodes = ["hmi", "safety_pilot"] }')],
