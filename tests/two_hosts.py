@@ -5,27 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from tests import system_file
-from tests.documents.page import Page
 
 ON_GROUND = ("hmi", "teleoperation", "DM5", "DM10", "DM11", "DM13")
 
 _PATIENT = """event = "non_control_node_crash"
 against = { within_s = 5.0, hazard = "the operator has neither page nor stick" }"""
-
-
-HOME_WHEN_LOST = Page("how-to/several-machines").of("toml")[1]
-"""The mechanism for a lost link that this page shows."""
-
-
-def home_when_lost(text: str) -> str:
-    """Return the full system's specification with a robot that goes home when none can reach it."""
-    for old, new in (
-            ("[[detection]]\n", f"{HOME_WHEN_LOST}\n[[detection]]\n"),
-            ('"overload"]', '"overload", "link_lost"]'),
-            ('RM8 = ["RM3", "RM4"]', 'RM8 = ["RM9"]\nRM9 = ["RM3", "RM4"]')):
-        assert old in text
-        text = text.replace(old, new, 1)
-    return text
 
 
 def several_hosts(addresses: Mapping[str, str], places: Mapping[str, Collection[str]],

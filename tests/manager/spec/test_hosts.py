@@ -8,11 +8,13 @@ from rampart.actors.system.hosts import Hosts
 from rampart.manager.spec.budget import check
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
-from tests.two_hosts import home_when_lost, two_hosts
+from tests.documents.page import Page
+from tests.two_hosts import two_hosts
 
 ADDRESSES = {"robot": "192.168.7.1", "ground": "192.168.7.2"}
 TEXT = two_hosts(ADDRESSES)
 SPEC = parse_specification(TEXT, "two.toml")
+WHEN_LOST = Page("how-to/several-machines").of("toml")[1]
 TWO = '[[host]]\nname = "ground"\naddress = "192.168.7.2"\n\n'
 
 
@@ -38,12 +40,11 @@ def test_a_module_beyond_the_link_has_so_much_less_time():
     assert far["FTM1"].detection_s == alone["FTM1"].detection_s
 
 
-def test_to_go_home_when_nobody_can_reach_the_robot_fits_in_what_the_specification_allows():
-    budgets = check(parse_specification(home_when_lost(TEXT), "home.toml"))
-    home, = (one for one in budgets if one.name == "FTM15")
-    assert home.time_left_s == 10.0
-    assert home.detection_s == 6.2
-    assert home.fits
+def test_the_mechanism_of_the_page_for_a_lost_link_fits_in_what_it_allows():
+    text = TEXT.replace('"overload"]', '"overload", "link_lost"]').replace(
+        "[[detection]]\n", f"{WHEN_LOST}\n[[detection]]\n", 1)
+    lost, = (one for one in check(parse_specification(text, "lost.toml")) if one.name == "FTM15")
+    assert (lost.time_left_s, lost.detection_s, lost.fits) == (10.0, 6.2, True)
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
