@@ -32,7 +32,6 @@ from rampart.actors.ros2.diagnostics import Diagnostics
 from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.links import (
     ActionCall,
-    OfferedService,
     Publication,
     ServiceCall,
     Subscription,
@@ -179,9 +178,7 @@ class Gateway(Actor):
                 if link.way == "subscribe":
                     found.append(topic_of(link, types))
                 elif link.way != "publish":
-                    found.append(answer_topic(link, types))
-                    if link.from_:
-                        found.append(request_topic(link, types))
+                    found += [answer_topic(link, types), request_topic(link, types)]
         return tuple(found)
 
     @classmethod
@@ -227,8 +224,6 @@ class Gateway(Actor):
             if link.way == "subscribe" and to is not None:
                 self._subscriptions[link.name] = Subscription(
                     self, link, to, self.chosen_topic(link.beside) if link.beside else None)
-            elif link.way == "serve" and to is not None:
-                OfferedService(self, link, to)
             elif link.way == "publish" and from_ is not None:
                 self._links[link.way, link.name] = Publication(self, link, from_)
             elif from_ is not None and to is not None:

@@ -258,17 +258,14 @@ def answer_topic(link: Ros2Link, types: Types) -> Topic[Any]:
     """
     if link.way == "goal":
         made: type[msgspec.Struct] = GoalState
-    elif link.way == "serve":
-        made = message_of(_part(link, _REQUEST), types)
     else:
         response = message_of(_part(link, _RESPONSE, link.answer), types)
         made = msgspec.defstruct(
             "Answer", [("done", bool), ("why", Text, ""), *(
                 (f.name, f.type | None, None) for f in msgspec.structs.fields(response))],
             bases=(Message,), frozen=True)
-    what = "Requests to" if link.way == "serve" else "Answers of"
     return Topic(link.to, made, BusQos.COMMAND, 0.0, "",
-                 f"{what} {link.name} of ROS 2, {link.type}.")
+                 f"Answers of {link.name} of ROS 2, {link.type}.")
 
 
 def _part(link: Ros2Link, part: str, fields: Mapping[str, Any] | None = None) -> Ros2Link:
@@ -360,45 +357,6 @@ class _Response:
         return self._translate(self._decode(answer))[0]
 
 
-class OfferedService:
-    """Offers a service to ROS 2: publishes each request, and answers it at once.
-
-    Args:
-        gateway: that offers it.
-        link: row of the specification, with the answer.
-        topic: of the system, for the requests.
-    """
-
-    def __init__(self, gateway: Gateway, link: Ros2Link, topic: Topic[Any]) -> None:
-        types = gateway.node.types
-        self._gateway, self._topic = gateway, topic
-        self._decode = types.decoder(f"{link.type}{_REQUEST}")
-        self._translate = Inward(_part(link, _REQUEST), types, topic.type)
-        self._response = _fixed_response(link, types)
-        gateway.node.serve(link.name, link.type, self._answer)
-
-    def _answer(self, payload: bytes) -> bytes:
-        body, _ = self._translate(self._decode(payload))
-        self._gateway.enqueue(None, lambda: self._gateway.emit(self._topic, body, None))
-        return self._response
-
-
-def _fixed_response(link: Ros2Link, types: Types) -> bytes:
-    """Return the encoded response of an offered service.
-
-    Raises:
-        ValueError: a field does not exist, or does not take its value.
-    """
-    name = f"{link.type}{_RESPONSE}"
-    blank = types.blank(name)
-    known = dict(types.fields(name))
-    for field, value in link.answer.items():
-        if field not in known:
-            raise ValueError(f"answer: {name} has no field {field!r}; known: {', '.join(known)}")
-        setattr(blank, field, value)
-    return types.encode(name, blank)
-
-
 class ActionCall:
     """Sends each message of a topic of the system as a goal to an action; a new goal replaces it.
 
@@ -470,7 +428,7 @@ class ActionCall:
 
 
 def check_call(link: Ros2Link, types: Types, asks: Any, answers: Any) -> None:
-    """Refuse a call, offered service or action that cannot be translated.
+    """Refuse a call or action that cannot be translated.
 
     Args:
         link: row of the specification.
@@ -484,10 +442,6 @@ def check_call(link: Ros2Link, types: Types, asks: Any, answers: Any) -> None:
     if link.way == "goal":
         Outward(_part(link, _GOAL), types, asks, lenient=True)
         types.hash(f"{link.type}{_SEND}")
-    elif link.way == "serve":
-        Inward(_part(link, _REQUEST), types, answers)
-        _fixed_response(link, types)
-        types.hash(link.type)
     else:
         Outward(_part(link, _REQUEST), types, asks, lenient=True)
         _Response(link, types, answers)

@@ -19,10 +19,8 @@ from __future__ import annotations
 import collections
 import functools
 import importlib
-import itertools
 import json
 import os
-import queue
 import socket
 import struct
 import sys
@@ -49,9 +47,6 @@ LATE_S = 0.5
 
 ALONE_S = 1.0
 """Another publisher of the same node that is silent for so long is gone, if messages lack gids."""
-
-ANSWER_S = 0.5
-"""Time that the gateway has to answer a request."""
 
 ACKNOWLEDGED_S = 0.1
 """Time that subscribers have to acknowledge the last messages."""
@@ -129,8 +124,6 @@ class Relay:
         self._own: set[str] = set()  # gids
         self._sent: collections.deque[tuple[str, bytes]] = collections.deque(maxlen=SENT)
         self._calls: dict[int, tuple[Any, Any]] = {}
-        self._answers: dict[int, queue.SimpleQueue[bytes | None]] = {}
-        self._numbers = itertools.count(1)
         self._ping = self._pong = 0
         self._graph: Any = None
         self._unnamed: dict[str, int] = {}  # gid → looks that have found it without a node
@@ -153,8 +146,6 @@ class Relay:
             while frame := self._channel.receive():
                 (word, *header), payload = frame
                 getattr(self, f"_on_{word}")(*header, payload)
-            for waiting in list(self._answers.values()):
-                waiting.put(None)
             for (kind, _), endpoint in self._endpoints.items():
                 if kind == PUBLISHER and hasattr(endpoint, "wait_for_all_acked"):
                     endpoint.wait_for_all_acked(rclpy.duration.Duration(seconds=ACKNOWLEDGED_S))
@@ -202,14 +193,7 @@ class Relay:
         if kind == SUBSCRIPTION:
             return self._node.create_subscription(
                 made, topic, self._receiver(topic), profile(**qos), raw=True)
-        if kind == CLIENT:
-            return self._node.create_client(made, topic)
-        service = self._node.create_service(
-            made, topic, functools.partial(self._requested, topic, made))
-        send = service.send_response
-        service.send_response = lambda response, header: (
-            None if response is None else send(response, header))
-        return service
+        return self._node.create_client(made, topic)
 
     def _on_put(self, topic: str, at_s: float, payload: bytes) -> None:
         endpoint = self._endpoints.get((PUBLISHER, topic))
@@ -239,10 +223,6 @@ class Relay:
         if call := self._calls.pop(number, None):
             client, future = call
             client.remove_pending_request(future)
-
-    def _on_answer(self, number: int, is_given: bool, payload: bytes) -> None:
-        if waiting := self._answers.get(number):
-            waiting.put(payload if is_given else None)
 
     # -- to the gateway --------------------------------------------------------------------------
 
@@ -275,20 +255,6 @@ class Relay:
         if hasattr(rclpy.subscription.Subscription, "CallbackType"):
             return take
         return lambda payload: take(payload, {})  # before Iron
-
-    def _requested(self, service: str, made: Any, request: Any, _response: Any) -> Any:
-        """Return the gateway's response, None if it gives none."""
-        number = next(self._numbers)
-        waiting = self._answers[number] = queue.SimpleQueue()
-        self._channel.send("request", number, service,
-                           payload=rclpy.serialization.serialize_message(request))
-        try:
-            payload = waiting.get(timeout=ANSWER_S)
-        except queue.Empty:
-            payload = None
-        del self._answers[number]
-        return None if payload is None else rclpy.serialization.deserialize_message(
-            payload, made.Response)
 
     def _look(self) -> None:
         if self._ping != self._pong:

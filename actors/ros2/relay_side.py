@@ -90,7 +90,6 @@ class RelaySide:
         self._pulse = Pulse(HANG_S, max(first_s, HANG_S), HANG_S)
         self._numbers = count(1)
         self._readers: dict[str, Deliver] = {}
-        self._servers: dict[str, Callable[[bytes, bytes | None, Reply], None]] = {}
         self._asked: dict[int, tuple[bytes, Answered, asyncio.TimerHandle]] = {}
         self._watchers: list[Callable[[str, bool], None]] = []
         self._own_tokens: list[str] = []
@@ -143,8 +142,8 @@ class RelaySide:
         self._readers[self._declare(EndpointKind.SUBSCRIPTION, key, qos)] = deliver
 
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
-        """See `Side.serve`; a request that is not answered at once gets no answer."""
-        self._servers[self._declare(EndpointKind.SERVICE, key, Qos())] = asked
+        """See `Side.serve`; only stand-ins offer services, and they use no relay."""
+        raise NotImplementedError
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:
@@ -293,19 +292,6 @@ class RelaySide:
                     ) -> None:
         self._readers[topic](payload, Attachment(
             sequence, stamp_ns, bytes.fromhex(gid) if gid else UNKNOWN_GID).pack())
-
-    def _on_request(self, number: int, service: str, payload: bytes) -> None:
-        is_answered = False
-
-        def reply(answer: bytes, _attachment: bytes) -> None:
-            nonlocal is_answered
-            is_answered = True
-            self._send("answer", number, True, payload=answer)
-
-        self._servers[service](
-            payload, Attachment(number, time.time_ns(), UNKNOWN_GID).pack(), reply)
-        if not is_answered:
-            self._send("answer", number, False)
 
     def _on_answer(self, number: int, is_given: bool, payload: bytes) -> None:
         if found := self._asked.pop(number, None):

@@ -215,12 +215,11 @@ async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> 
 
 
 _OURS = {"subscribe": EndpointKind.SUBSCRIPTION, "publish": EndpointKind.PUBLISHER,
-         "call": EndpointKind.CLIENT, "serve": EndpointKind.SERVICE}
+         "call": EndpointKind.CLIENT}
 _THEIRS = {"subscribe": EndpointKind.PUBLISHER, "publish": EndpointKind.SUBSCRIPTION,
-           "call": EndpointKind.SERVICE, "serve": EndpointKind.CLIENT}
+           "call": EndpointKind.SERVICE}
 _MISSING = {"subscribe": "no node publishes it", "publish": "no node subscribes to it",
-            "call": "no node serves it", "serve": "no node calls it yet",
-            "goal": "no server of this action"}
+            "call": "no node serves it", "goal": "no server of this action"}
 
 
 async def _why_empty(there: Onlooker, domain: int) -> str:
@@ -255,7 +254,7 @@ async def _passed(side: ZenohSide, gateway: Gateway.Parameters, types: Types,
     counts: Counter[str] = Counter()
     keys = {}
     for link, finding in zip(gateway.ros2, links, strict=True):
-        if finding.well and link.way != "serve":
+        if finding.well:
             topic, kind = _exchanged(link)
             keys[finding.what] = key = data_key(gateway.domain, topic, dds_name(kind),
                                                 types.hash(kind))
@@ -301,7 +300,7 @@ def _of_link(link: Ros2Link, graph: RosGraph, node: Endpoint, types: Types, unli
         if not there:
             return Finding(what, False, f"published by {found}; expected {link.publisher}")
     if not there:
-        return Finding(what, way == "serve", _MISSING[link.way])
+        return Finding(what, False, _MISSING[link.way])
     if problems := list(dict.fromkeys(misfits([mine], there))):
         return Finding(what, False, problems[0] + _fitting(mine, kind, there))
     if far := [one.full_name for one in there if one.session in unlinked]:

@@ -33,21 +33,20 @@ GATEWAY = "rampart.actors.ros2.gateway:Gateway"
 ROUTER = "tcp/localhost:7447"
 """Where the router of `rmw_zenoh` listens by default."""
 
-WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"), "serve": ("to",),
-         "goal": ("from", "to")}
-"""The five kinds of links, each with the keys of its topics of the system."""
+WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"),
+        "goal": ("from", "to")}
+"""The four kinds of links, each with the keys of its topics of the system."""
 
 
 class Ros2Link(Table, frozen=True, kw_only=True):
     """A topic, service or action of ROS 2, and the topics of the system that it is linked to.
 
-    One of `subscribe`, `publish`, `call`, `serve` and `goal` names it.
+    One of `subscribe`, `publish`, `call` and `goal` names it.
 
     Attributes:
         subscribe: Topic of ROS 2 whose messages are published on `to`.
         publish: Topic of ROS 2 on which the messages of `from` are published.
         call: Service of ROS 2 that is called with each message of `from`; the answer is on `to`.
-        serve: Service that is offered to ROS 2; its requests are published on `to`.
         goal: Action of ROS 2 that receives each message of `from` as its goal; the goal's state is
             on `to`.
         type: Type of the messages in ROS 2, or of the service or action.
@@ -56,8 +55,7 @@ class Ros2Link(Table, frozen=True, kw_only=True):
         fields: Field that is written → how it is read: a field of the other side, a number, a truth
             value, or a function of fields (`rampart.actors.ros2.translation.expressions`). Other
             fields follow the ready form of `type`.
-        answer: The same for the answer: of a call or goal, on `to`; or of `serve`, with numbers,
-            truth values and texts only.
+        answer: The same for the answer of a call, on `to`.
         frame: Frame of messages to ROS 2, and required of messages from there; "" for any.
         child: Child frame of the transform that is meant, in a message of `tf`.
         beside: Key of a topic of the system whose newest message can be read too, as
@@ -83,7 +81,6 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     subscribe: OptionalRosName = ""
     publish: OptionalRosName = ""
     call: OptionalRosName = ""
-    serve: OptionalRosName = ""
     goal: OptionalRosName = ""
     to: str = ""
     from_: str = msgspec.field(name="from", default="")
@@ -145,15 +142,15 @@ def _find_wrong(number: int, links: Sequence[Ros2Link],
         return
     way, = ways
     yield from _wrong_keys(way, link)
-    kind = {"call": "srv", "serve": "srv", "goal": "action"}.get(way)
+    kind = {"call": "srv", "goal": "action"}.get(way)
     if kind is not None and link.type.split("/")[1] not in {kind, "action"}:
         yield Finding(".type", f"with {way}, expected package/{kind}/Name", (link.type,))
     if link.stop_after_s and way != "publish":
         yield Finding(".stop_after_s", "is for publish", (link.stop_after_s,))
     if link.publisher and way != "subscribe":
         yield Finding(".publisher", "is for subscribe", (link.publisher,))
-    if link.answer and way not in {"call", "serve", "goal"}:
-        yield Finding(".answer", "is for call, serve or goal", (link.answer,))
+    if link.answer and way != "call":
+        yield Finding(".answer", "is for call", (link.answer,))
     subscribed = {one.to for one in links if one.subscribe}
     if link.beside and (way != "subscribe" or link.beside not in subscribed):
         yield Finding(".beside", "expected the `to` of another subscription", (link.beside,))

@@ -2,11 +2,10 @@
 
     python rclpy_peer.py base|camera|rival|wrong|reporter
 
-`base` publishes /odom 20 times a second (best effort) and its name once (transient local), offers
-/base/shut, the action /count and the lifecycle node /camera, and calls /rampart/stop for a line on
-standard input. `camera` is that lifecycle node alone. `rival` publishes /odom and /cmd_vel too;
-`wrong` publishes texts on /odom. Each writes a line of JSON for each message, request and
-transition.
+`base` publishes /odom 20 times a second (best effort) and its name once (transient local), and
+offers /base/shut, the action /count and the lifecycle node /camera. `camera` is that lifecycle node
+alone. `rival` publishes /odom and /cmd_vel too; `wrong` publishes texts on /odom. Each writes a
+line of JSON for each message, request and transition.
 
 `reporter` publishes the status of a lidar ten times a second, logs, and ends goals of /count. A
 word on standard input sets that: well, bad or quiet (no status); log (a line); succeed or abort.
@@ -91,14 +90,6 @@ def base():
         return Fibonacci.Result(sequence=[0, 1])
 
     node.held = name, ActionServer(node, Fibonacci, "/count", count)
-    client = node.create_client(SetBool, "/rampart/stop")
-
-    def listen():
-        for line in sys.stdin:
-            client.call_async(SetBool.Request(data=line.strip() == "stop")).add_done_callback(
-                lambda future: say(answer=future.result().message))
-
-    threading.Thread(target=listen, daemon=True).start()
     return [node, Camera()]
 
 

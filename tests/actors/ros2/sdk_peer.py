@@ -3,7 +3,7 @@
     python sdk_peer.py PORT SHARE
 
 It says its odometry 20 times a second, offers /base/shut, and writes a line of JSON for each
-command that it hears; a line on standard input calls /rampart/stop, "stop" with true.
+command that it hears.
 """
 
 from __future__ import annotations
@@ -11,12 +11,10 @@ from __future__ import annotations
 import json
 import os
 import sys
-import threading
 import time
 
 from zenoh_ros2_sdk import message_registry
 from zenoh_ros2_sdk.publisher import ROS2Publisher
-from zenoh_ros2_sdk.service_client import ROS2ServiceClient
 from zenoh_ros2_sdk.service_server import ROS2ServiceServer
 from zenoh_ros2_sdk.session import ZenohSession
 from zenoh_ros2_sdk.subscriber import ROS2Subscriber
@@ -45,14 +43,6 @@ def main():
         return response(success=bool(request.data), message="by the other implementation")
 
     ROS2ServiceServer("/base/shut", "std_srvs/srv/SetBool", shut, **there)
-    client = ROS2ServiceClient("/rampart/stop", "std_srvs/srv/SetBool", timeout=5.0, **there)
-
-    def listen():
-        for line in sys.stdin:
-            answer = client.call(data=line.strip() == "stop")
-            say(answer=None if answer is None else answer.message)
-
-    threading.Thread(target=listen, daemon=True).start()
     types = registry.session.store.types
 
     def made(name, **fields):

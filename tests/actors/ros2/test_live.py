@@ -11,7 +11,7 @@ import pytest
 from rampart.testing import RealRun, free_port, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_against_ros import PYTHON, ROS
-from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_gateway import beside_foreign
 from tests.real_tools import printed
 
 pytestmark = [pytest.mark.ros, pytest.mark.processes]
@@ -62,33 +62,16 @@ kind = "non-control"
 parameters = {{ listen = "tcp/127.0.0.1:{port}" }}
 """
 
-SERVICES = """
-[[ros2]]
-call = "/base/shut"
-type = "std_srvs/srv/SetBool"
-from = "base/shut"
-to = "base/is_shut"
-
-[[ros2]]
-serve = "/rampart/stop"
-type = "std_srvs/srv/SetBool"
-to = "base/stop"
-answer = { success = true, message = "told" }
-"""
-
-
 def echoed(run, key, count=1):
     lines = printed(run, "topic", "echo", key, "-n", str(count), "--json", "--duration", "15")
     return [json.loads(line)["message"] for line in lines.splitlines()]
 
 
 def check_passing(run, peer):
-    """Wait until topics and services pass both ways."""
+    """Wait until topics pass both ways, and a service is called."""
     run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
     assert set(peer.said("heard")) <= {0.5}
     run.wait_until(lambda: True in peer.said("shut"), 10, "no request")
-    peer.ask("stop")
-    run.wait_until(lambda: "told" in peer.said("answer"), 10, "no answer")
     assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
     run.wait_until(lambda: [one["message"] for one in echoed(run, "base/is_shut")] == [
         "by the other implementation"], 10, "no answer")
@@ -97,16 +80,9 @@ def check_passing(run, peer):
 def test_topics_and_services_both_ways(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     port = free_port()
-    text = SYSTEM.replace('''actor = "tests.actors.ros2.robot:Base"
-kind = "world"
-''', '''actor = "tests.actors.ros2.robot:Asker"
-kind = "control"
-''').replace('''actor = "rampart.actors.ros2.gateway:Gateway"
-''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
-parameters = {{ connect = ["tcp/127.0.0.1:{port}"], distribution = "kilted" }}
-''')
     path = tmp_path / "guarded.toml"
-    path.write_text(text + ROUTER.format(port=port) + SERVICES)
+    path.write_text(beside_foreign(connect=[f"tcp/127.0.0.1:{port}"], distribution="kilted")
+                    + ROUTER.format(port=port))
     with RealRun(tmp_path, path) as run:
         with Peer(PEER, str(port), ROS / "share") as peer:
             check_passing(run, peer)

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.ros2_lost_machine import Reader, start
 from rampart.testing import free_port, wait_until
 from tests import ROOT
-from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_gateway import configured
 from tests.whole.network import network, why_not
 
 pytestmark = [pytest.mark.processes, pytest.mark.skipif(bool(why_not()), reason=why_not())]
@@ -26,7 +26,7 @@ def on_ground(network, *words):
 
 def test_a_client_exchanges_messages_and_the_check_knows_that_a_peer_does_not(tmp_path):
     port, output = free_port(), tmp_path / "robot.txt"
-    path, head = tmp_path / "guarded.toml", 'actor = "rampart.actors.ros2.gateway:Gateway"\n'
+    path = tmp_path / "guarded.toml"
     with network(["robot", "ground"]) as net, output.open("w") as out:
         robot = net.addresses["robot"]
         process = subprocess.Popen(net.command(
@@ -35,8 +35,7 @@ def test_a_client_exchanges_messages_and_the_check_knows_that_a_peer_does_not(tm
         try:
             wait_until(lambda: "up" in output.read_text(), 20)
             for mode, passes in (("client", True), ("peer", False)):
-                path.write_text(SYSTEM.replace(head, f'{head}parameters = {{ connect = '
-                                               f'["tcp/{robot}:{port}"], mode = "{mode}" }}\n'))
+                path.write_text(configured(connect=[f"tcp/{robot}:{port}"], mode=mode))
                 before = output.read_text().count("0.25")
                 done = on_ground(net, "-m", "tests.actors.ros2.far_robot", robot, str(port), mode)
                 assert (int(done.stdout) > 20) is passes, done.stderr

@@ -21,8 +21,8 @@ from rampart.actors.supervision.kill_node import signal_node
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_against_ros import PYTHON, ROS
-from tests.actors.ros2.test_gateway import SYSTEM
-from tests.actors.ros2.test_live import SERVICES, Peer, check_passing, echoed
+from tests.actors.ros2.test_gateway import beside_foreign
+from tests.actors.ros2.test_live import Peer, check_passing, echoed
 from tests.actors.ros2.test_reports import REPORTS
 from tests.cli.look.test_ros_verbs import checked
 from tests.real_tools import printed
@@ -48,17 +48,11 @@ def domain(monkeypatch):
 @pytest.fixture
 def system(tmp_path, domain):
     def write(more="", setup=SETUP):
-        text = SYSTEM.replace('''actor = "tests.actors.ros2.robot:Base"
-kind = "world"
-''', '''actor = "tests.actors.ros2.robot:Asker"
-kind = "control"
-''').replace('''actor = "rampart.actors.ros2.gateway:Gateway"
-''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
-parameters = {{ middleware = "rclpy", setup = "{setup}", domain = {domain}, \
-distribution = "kilted", interfaces = ["interfaces"] }}
-''').replace('frame = "odom"\n', 'frame = "odom"\nreliable = false\n')
+        text = beside_foreign(middleware="rclpy", setup=str(setup), domain=domain,
+                              distribution="kilted", interfaces=["interfaces"])
         path = tmp_path / "guarded.toml"
-        path.write_text(text + SERVICES + more)
+        path.write_text(text.replace('frame = "odom"\n', 'frame = "odom"\nreliable = false\n')
+                        + more)
         where = tmp_path / "interfaces/test_msgs/action"
         where.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROS / "share/test_msgs/action/Fibonacci.action", where)

@@ -13,7 +13,7 @@ from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Qos
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
-from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_gateway import configured
 from tests.cli.look.test_ros_verbs import (
     EVERYTHING,
     Robot,
@@ -37,15 +37,12 @@ def written(tmp_path, port):
     """Write the system of a gateway at a router with TLS, without the stand-in of the robot."""
     make_credentials(tmp_path)
     path = tmp_path / "guarded.toml"
-    path.write_text(SYSTEM.replace('''
+    path.write_text(configured(shown(), connect=[f"tls/127.0.0.1:{port}"]).replace('''
 [[node]]
 name = "base"
 actor = "tests.actors.ros2.robot:Base"
 kind = "world"
-''', "").replace('frame = "odom"\n', "").replace('''actor = "rampart.actors.ros2.gateway:Gateway"
-''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
-parameters = {{ connect = ["tls/127.0.0.1:{port}"]{shown()} }}
-'''))
+''', "").replace('frame = "odom"\n', ""))
     return path
 
 
@@ -72,11 +69,12 @@ def test_the_gateway_passes_and_finds_each_new_router(tmp_path, monkeypatch):
 
 
 TOPIC = ["put", "declare_subscriber"]
-SERVICE = ["query", "reply", "declare_queryable"]
+SERVICE = ["query", "reply"]
 LISTED = {  # as docs/reference/ros2.md lists them
     "graph": (LIVELINESS, ["@ros2_lv/0/**"]),
     "topics": (TOPIC, ["0/odom/**", "0/cmd_vel/**"]),
-    "kept": ([*TOPIC, *SERVICE, *LIVELINESS], ["0/map/**", "0/map/**/@adv/**"]),
+    "kept": ([*TOPIC, *SERVICE, "declare_queryable", *LIVELINESS],
+             ["0/map/**", "0/map/**/@adv/**"]),
     "services": (SERVICE, ["0/base/shut/**"])}
 
 

@@ -23,7 +23,7 @@ from rampart.actors.ros2.wire import Qos
 from rampart.cli.look import ros_check
 from rampart.cli.main import main
 from rampart.testing import free_port
-from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_gateway import configured
 
 
 def opened(settings):
@@ -88,11 +88,8 @@ def impatient(monkeypatch):
 def system(tmp_path):
     def write(port, distribution="jazzy", mode="client", protocol="tcp", more=""):
         path = tmp_path / "guarded.toml"
-        path.write_text(SYSTEM.replace(
-            'actor = "rampart.actors.ros2.gateway:Gateway"\n',
-            'actor = "rampart.actors.ros2.gateway:Gateway"\nparameters = { connect = '
-            f'["{protocol}/127.0.0.1:{port}"], distribution = "{distribution}", mode = "{mode}"'
-            f'{more} }}\n'))
+        path.write_text(configured(more, connect=[f"{protocol}/127.0.0.1:{port}"],
+                                   distribution=distribution, mode=mode))
         return str(path)
 
     return write
