@@ -94,20 +94,6 @@ async def test_a_mission_is_started_from_the_page_unless_one_runs(world, hmi, pa
     assert (await ask(page, type="mission", name="A"))["text"] == "mission B is running"
 
 
-async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, page):
-    for text in (
-            "", "not json", "[]", '{"type": "reset"}', '{"type": "format", "disk": "c"}',
-            '{"type": "reset", "recovery": "RM1", "extra": 1}', "[" * 4000, b"\xff\xfe\x00",
-            *(f'{{"type": "order"{more}}}' for more in (
-                "", ', "action": "PAUSE"', ', "action": "pause", "by": "RM6"',
-                ', "action": "pause", "reason": "' + 201 * "x" + '"'))):
-        await page.send(text)
-        assert "not understood" in (await hear(page, "error"))["text"], text
-    world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-    assert (await hear(page, "state"))["pose"]
-    assert (world.others.resets, world.others.orders) == ([], [])
-
-
 async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_is_shown(
         world, hmi, page):
     told = await ask(page, type="order", action="pause")

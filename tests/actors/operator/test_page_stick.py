@@ -7,10 +7,8 @@ import pytest
 from rampart.actors.operator.panels import Panel
 from rampart.testing import eventually
 from tests.actors.operator.page import show
-from tests.actors.operator.test_operating import Hand as Driver
 from tests.actors.operator.test_page_operating import key
 from tests.actors.operator.test_stick_panel import AT_REST, DRIVE, driven, rests
-from tests.actors.operator.world import open_page
 from tests.tank import Hand
 
 pytestmark = [pytest.mark.page, pytest.mark.usefixtures("patient")]
@@ -26,16 +24,10 @@ def state(panel: str = "Drive") -> str:
     return f"{of(panel, '.stick-state')}.textContent"
 
 
-async def is_told(robot, hand: Hand) -> None:
-    await eventually(lambda: robot.hands[-1] == hand)
-
-
 async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_s(world, tab):
-    async with driven(world, DRIVE, LIFT) as (robot, hmi, at):
+    async with driven(world, DRIVE, LIFT) as (robot, hmi, _):
         await show(tab, hmi)
         await tab.until(f"{state()} === 'free'")
-        how = await tab.value(f"{of('Lift', '.stick-words')}.textContent")
-        assert "click it and hold the up or down key, W or S. Letting go stops" in how
         await tab.value(f"{of('Lift', '.stick')}.focus()")
         await key(tab, "a", down=True)
         await rests(robot)
@@ -48,10 +40,7 @@ async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_
             "navigator.getGamepads = () => [{connected: true, axes: [0, -1], buttons:"
             " Array.from({length: 8}, (_, i) => ({pressed: window.held && i === 4}))}];"
             "dispatchEvent(new Event('gamepadconnected')); window.held = true")
-        await is_told(robot, Hand(0.25, 0.0, True))
+        await eventually(lambda: robot.hands[-1] == Hand(0.25, 0.0, True))
         assert await tab.value(state("Lift")) == "free"
         await tab.value("window.held = false")
         await rests(robot)
-        async with open_page(at) as other:
-            await Driver(other).take()
-            await tab.until(f"{state()} === 'page 2 drives'")

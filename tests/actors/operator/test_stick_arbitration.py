@@ -62,19 +62,6 @@ def test_who_is_followed(page, device, followed):
     assert play(page, device) == followed
 
 
-def test_who_waits_or_was_lost_is_told_why_and_a_release_stops_once():
-    arbiter = StickArbiter(LONG_AGO)
-    arbiter.offer("page", HELD, 0.0, 0.0)
-    assert arbiter.offer("device", HELD, 0.1, 0.1).told == "not followed: page has the stick"
-    lost = arbiter.expire(1.0)
-    assert (lost.released, lost.whom) == (True, "page")
-    assert "silent for 0.3 s" in lost.told
-    assert "let go first" in arbiter.offer("page", HELD, 1.1, 1.1).told
-    arbiter.offer("page", FREE, 1.2, 1.2)
-    arbiter.offer("page", HELD, 1.3, 1.3)
-    assert [arbiter.offer("page", FREE, t, t).released for t in (1.4, 1.5)] == [True, False]
-
-
 def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
     arbiter = StickArbiter(started_s=10.0)
     assert "let go first" in arbiter.offer("page", HELD, 10.1, 10.1).told

@@ -231,7 +231,7 @@ async def test_what_is_no_message_of_this_stick_moves_nothing(world):
             told = await ask(page, type="stick", panel="Drvie", held=True)
             assert told == {"type": "error", "text": "no stick 'Drvie'; known: Drive"}
             for wrong in ('"forward":NaN', '"forward":1e999', '"left":"x"', '"forward":[1]',
-                          '"forward":-1e308'):
+                          '"forward":-1e308', '"extra":1'):
                 await page.send(f'{{"type":"stick","panel":"Drive","held":true,{wrong}}}')
                 assert "not understood" in (await hear(page, "error"))["text"]
     assert set(robot.hands) <= {AT_REST}
