@@ -154,8 +154,8 @@ async def test_a_page_is_greeted_then_gets_everything_then_changes():
 async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest():
     async with Pushing() as p:
         await p.line.until(lambda frames: len(frames) >= 2)
-        p.page.seen(0)
         for i in range(30):
+            p.page.seen(0)  # an older frame than the last
             p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
             await asyncio.sleep(hmi_feed.FRAME_GAP_S / 4)
         on_the_way = len(p.line.frames) - 1

@@ -33,9 +33,13 @@ def test_timeouts_threads_and_queues_of_asyncio_work_on_it():
     assert run(scenario) == 3608.0
 
 
-@given(st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.0]) | st.floats(0, 2), st.booleans()),
+WAYS = st.sampled_from(["posted", "timer", "withdrawn"])
+
+
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.0]) | st.floats(0, 2), WAYS),
                 max_size=30))
-def test_posted_calls_and_timers_share_one_order_of_time_and_of_scheduling_if_at_once(calls):
+def test_posted_calls_and_timers_share_one_order_and_what_was_withdrawn_is_not_called(calls):
+    """The order is that of time, and of scheduling if at once."""
     async def scenario():
         loop, seen = asyncio.get_running_loop(), []
 
@@ -43,12 +47,22 @@ def test_posted_calls_and_timers_share_one_order_of_time_and_of_scheduling_if_at
             assert loop.time() == when
             seen.append((when, i))
 
-        for i, (when, posted) in enumerate(calls):
-            (loop.post_at if posted else loop.call_at)(when, note, when, i)
+        def gone(when, i):
+            seen.append("what was withdrawn")
+
+        for i, (when, way) in enumerate(calls):
+            (loop.call_at if way == "timer" else loop.post_at)(
+                when, gone if way == "withdrawn" else note, when, i)
+        loop.withdraw([gone])
+        for call in (loop.call_later(50, gone, 0, 0), loop.call_soon(gone, 0, 0)):
+            call.cancel()
+            assert call.cancelled()
         await asyncio.sleep(3)
+        assert loop.time() == 3.0  # what was cancelled costs no time
         return seen
 
-    assert run(scenario) == sorted((when, i) for i, (when, _) in enumerate(calls))
+    assert run(scenario) == sorted(
+        (when, i) for i, (when, way) in enumerate(calls) if way != "withdrawn")
 
 
 @pytest.mark.parametrize("posted", [True, False])
@@ -65,42 +79,9 @@ def test_a_call_that_raises_is_reported_and_those_due_with_it_are_made(posted):
     assert run(scenario) == (["after"], [ZeroDivisionError])
 
 
-@given(st.lists(st.tuples(st.sampled_from([1.0, 1.5, 2.0]), st.booleans()), max_size=30))
-def test_what_was_withdrawn_is_not_called_and_the_rest_keeps_its_order(calls):
-    async def scenario():
-        loop, seen = asyncio.get_running_loop(), []
-
-        def stays(when, i):
-            seen.append((when, i))
-
-        def goes(when, i):
-            seen.append("what was withdrawn")
-
-        loop.post_at(0.5, lambda _one, _two: loop.withdraw([goes]), None, None)
-        for i, (when, kept) in enumerate(calls):
-            loop.post_at(when, stays if kept else goes, when, i)
-        loop.call_at(1.0, stays, 1.0, len(calls))
-        for call in (loop.call_later(50, goes, 0, 0), loop.call_soon(goes, 0, 0)):
-            call.cancel()
-            assert call.cancelled()
-        await asyncio.sleep(3)
-        assert loop.time() == 3.0  # what was cancelled costs no time
-        return seen
-
-    kept = [(when, i) for i, (when, kept) in enumerate(calls) if kept]
-    assert run(scenario) == sorted([*kept, (1.0, len(calls))])
-
-
-class _Slow:
-    """A network on which everything takes a second."""
-
-    def link(self, source, reader):
-        return lambda now_s: (now_s + 1.0,)
-
-
 def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
     async def scenario():
-        hub, seen = Hub(_Slow().link), []
+        hub, seen = Hub(lambda _source, _reader: lambda now_s: (now_s + 1.0,)), []
         buses = {name: VirtualBus(hub, name) for name in ("talker", "killed", "other")}
         for name, bus in buses.items():
             await bus.open()
