@@ -24,12 +24,7 @@ from rampart.actors.operator.injection import Injections, places_of
 from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.requests import Pending, RefusedError, Request
 from rampart.actors.operator.stick import Stick
-from rampart.actors.supervision.kill_node import (
-    SIGNALS,
-    SignalError,
-    UnknownNodeError,
-    signal_node,
-)
+from rampart.actors.supervision.kill_node import SIGNALS, SignalError, UnknownNodeError, signal_node
 from rampart.manager.strategies.registry import STRATEGIES
 
 if TYPE_CHECKING:

@@ -38,12 +38,7 @@ from rampart.sim.campaign.statistics import (
 )
 from rampart.sim.campaign.store import Run
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.report import (
-    NONE,
-    Moment,
-    environment,
-    margin_text,
-)
+from rampart.sim.runs.report import NONE, Moment, environment, margin_text
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
 

@@ -11,12 +11,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.sim.campaign.job import (
-    Job,
-    application_of_system,
-    faults_of_system,
-    trial_of_system,
-)
+from rampart.sim.campaign.job import Job, application_of_system, faults_of_system, trial_of_system
 from rampart.sim.campaign.store import Run
 from rampart.sim.runs.report import NONE
 

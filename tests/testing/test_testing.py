@@ -11,15 +11,7 @@ import pytest
 from rampart.actors.bus import topics
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.runtime.actor import Actor, every
-from rampart.testing import (
-    VirtualSystem,
-    eventually,
-    play,
-    run,
-    virtual_run,
-    wait_until,
-    wake,
-)
+from rampart.testing import VirtualSystem, eventually, play, run, virtual_run, wait_until, wake
 from tests import CELL
 
 

@@ -17,15 +17,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.testing import eventually
 from tests.actors.operator.page import show
-from tests.actors.operator.world import (
-    AIRPORT,
-    RATE,
-    ask,
-    hear,
-    repeated,
-    served,
-    visited,
-)
+from tests.actors.operator.world import AIRPORT, RATE, ask, hear, repeated, served, visited
 
 
 async def test_the_mission_is_asked_for_when_the_last_node_runs_until_it_is_taken_and_never_again(

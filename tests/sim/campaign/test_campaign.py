@@ -17,8 +17,6 @@ from functools import partial
 import msgspec
 import psutil
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rampart.cli import systems
 from rampart.cli.analyse import campaigning
@@ -27,28 +25,11 @@ from rampart.sim.campaign.content import with_content
 from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.statistics import (
-    badness,
-    rate,
-    table,
-    total,
-    worst,
-)
+from rampart.sim.campaign.statistics import badness, rate, table, total, worst
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.sim.osmosis.trial import paper_tables as paper
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from rampart.sim.osmosis.trial.paper_tables import (
-    AS_THE_PAPER,
-    CONDITIONS,
-    FAULTS,
-    FULL,
-    WITH_FTM,
-    cells,
-    condition_of,
-    full_jobs,
-    paper_jobs,
-    table_iii,
-)
 from rampart.testing import wait_until
 from tests import CELL, ROOT
 from tests.porter_actors import write_porter_system
@@ -233,7 +214,7 @@ def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(campaigning, "write_campaign_report", broken)
-    lost = with_content(full_jobs())[0]
+    lost = with_content(paper.full_jobs())[0]
     made_up[lost.key] = result(safe=False)
     assert rampart(["campaign", "--paper", "--full", "--json", "--out", str(tmp_path)]) == 1
     told = capsys.readouterr()
@@ -242,15 +223,6 @@ def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
 
 
 # ---- what is counted -------------------------------------------------------------------------
-
-
-@given(st.integers(1, 3000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_the_interval_holds_the_share_and_narrows_with_more_runs(pair):
-    count, of = pair
-    found = rate(count, of)
-    assert 0 <= found.low <= found.share <= found.high <= 1
-    more = rate(count * 4, of * 4)
-    assert more.high - more.low < found.high - found.low
 
 
 def test_the_interval_is_wilsons():
@@ -296,11 +268,11 @@ def test_the_worst_run_is_unsafe_before_failed_before_close():
 def test_conditions_are_rows_of_their_own():
     runs = [run for condition in (
         {}, {"options": {"obstacles": 2}}, {"ftm": False}, {"strategy": "mission-first"},
-        {"retuned": AS_THE_PAPER})
+        {"retuned": paper.AS_THE_PAPER})
         for run in runs_of(result(), **condition)]
     assert [(r.options, r.ftm, r.strategy, r.retuned) for r in table([*runs, *runs])] == [
         ({}, True, "", {}), ({"obstacles": 2}, True, "", {}), ({}, False, "", {}),
-        ({}, True, "mission-first", {}), ({}, True, "", AS_THE_PAPER)]
+        ({}, True, "mission-first", {}), ({}, True, "", paper.AS_THE_PAPER)]
     assert total(runs, "all").runs == 5
 
 
@@ -308,17 +280,17 @@ def test_conditions_are_rows_of_their_own():
 
 
 def test_table_iii_is_the_papers():
-    assert [row.agrees for row in table_iii(PAPER)] == [True] * 4
+    assert [row.agrees for row in paper.table_iii(PAPER)] == [True] * 4
 
 
 def test_every_row_of_the_papers_tables_is_run_under_every_condition():
-    jobs = paper_jobs()
+    jobs = paper.paper_jobs()
     assert len(jobs) == len({job.key for job in jobs})
     assert {job.system for job in jobs} == {"paper"}
     assert {(j.row, j.options["obstacles"]) for j in jobs} == {
-        (fault, n) for fault in FAULTS for n in (0, 2)}
-    found = cells([Run(job, result()) for job in jobs])
-    assert len(found) == len(CONDITIONS) * len(FAULTS) * 2
+        (fault, n) for fault in paper.FAULTS for n in (0, 2)}
+    found = paper.cells([Run(job, result()) for job in jobs])
+    assert len(found) == len(paper.CONDITIONS) * len(paper.FAULTS) * 2
     assert {cell.ours for cell in found} == {"success, safe"}
     assert [c.agrees for c in found if c.fault == "none"] == [True] * 6
     assert not any(c.agrees for c in found if c.fault == "command not updated")
@@ -328,14 +300,15 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
     def what_goes_wrong(job: Job) -> tuple[object, ...]:
         return job.row, job.faults, job.options, job.seed, job.network
 
-    jobs = full_jobs("B", seed=5)
+    jobs = paper.full_jobs("B", seed=5)
     assert {(j.system, j.strategy, j.ftm) for j in jobs} == {("osmosis", "", True)}
-    assert {condition_of(j) for j in jobs} == {FULL}
+    assert {paper.condition_of(j) for j in jobs} == {paper.FULL}
     assert not any(j.retuned for j in jobs)
-    for condition in CONDITIONS[1:]:
+    for condition in paper.CONDITIONS[1:]:
         assert [what_goes_wrong(j) for j in jobs] == [
-            what_goes_wrong(j) for j in paper_jobs("B", seed=5) if condition_of(j) == condition]
-    assert {j.system for j in full_jobs(system="other.toml")} == {"other.toml"}
+            what_goes_wrong(j) for j in paper.paper_jobs("B", seed=5)
+            if paper.condition_of(j) == condition]
+    assert {j.system for j in paper.full_jobs(system="other.toml")} == {"other.toml"}
 
 
 # ---- the verb --------------------------------------------------------------------------------
@@ -432,8 +405,9 @@ def jobs_in(directory) -> list[Job]:
 
 
 @pytest.mark.parametrize(("chosen", "jobs"), [
-    ((), paper_jobs()), (("--system", "osmosis"), paper_jobs(system="osmosis")),
-    (("--full",), full_jobs()), (("--full", "--system", "paper"), full_jobs(system="paper"))])
+    ((), paper.paper_jobs()), (("--system", "osmosis"), paper.paper_jobs(system="osmosis")),
+    (("--full",), paper.full_jobs()),
+    (("--full", "--system", "paper"), paper.full_jobs(system="paper"))])
 def test_the_papers_tables_are_of_its_system_and_full_of_the_full_one_unless_one_is_named(
         tmp_path, made_up, capsys, chosen, jobs):
     assert rampart(["campaign", "--paper", *chosen, "--out", str(tmp_path)]) == 0
@@ -448,9 +422,9 @@ def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_co
     rows = json.loads(capsys.readouterr().out)
     assert len(rows) == 12
     assert {(r["expected"], r["ours"]) for r in rows} == {("success, safe",) * 2}
-    assert {r["fault"]: r["paper"] for r in rows} == {f: v[0] for f, v in WITH_FTM.items()}
+    assert {r["fault"]: r["paper"] for r in rows} == {f: v[0] for f, v in paper.WITH_FTM.items()}
 
-    lost = next(job for job in with_content(full_jobs())
+    lost = next(job for job in with_content(paper.full_jobs())
                 if job.row == "command not updated" and job.options["obstacles"])
     made_up[lost.key] = result(success=False, reasons=("goal 2 of 9 not reached",))
     assert rampart([*arguments, str(tmp_path / "bad")]) == 1

@@ -24,11 +24,7 @@ from rampart.sim.campaign.report import (
     worth_showing,
     write_campaign_report,
 )
-from rampart.sim.campaign.statistics import (
-    badness,
-    percent,
-    rate,
-)
+from rampart.sim.campaign.statistics import badness, percent
 from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
@@ -105,7 +101,6 @@ def test_the_headline_counts_a_run_that_ends_badly_though_its_fault_had_no_effec
 
 def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsafe():
     told = headline([run(seed=seed) for seed in range(1000)])
-    assert percent(rate(0, 1000).high) == "0.4"
     assert "none of 1,000 runs" in told
     assert "at most 0.4\N{NO-BREAK SPACE}%" in told
 
@@ -132,18 +127,12 @@ def test_the_page_needs_nothing_but_itself():
 def test_the_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     made = run()
     page = write_campaign_report(tmp_path / "new", ABOUT, [made])
-    assert page == tmp_path / "new" / "report.html"
-    assert page.read_text(encoding="utf-8") == render(tmp_path / "new", ABOUT, [made])
-    before = page.read_bytes()
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(Path, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    before = render(tmp_path / "new", ABOUT, [made])
+    assert page.read_text(encoding="utf-8") == before
+    monkeypatch.delattr(Path, "replace")  # of the new page by the old one
+    with pytest.raises(AttributeError):
         write_campaign_report(tmp_path / "new", ABOUT, [])
-    assert [p.name for p in page.parent.iterdir()] == ["report.html"]
-    assert page.read_bytes() == before
+    assert [file.read_text(encoding="utf-8") for file in page.parent.iterdir()] == [before]
 
 
 # -- the paper's tables ------------------------------------------------------------------------

@@ -21,10 +21,7 @@ from rampart.cli.look.topic_catalogue import resolve
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
-from rampart.sim.osmosis.trial.faults import (
-    PAPER_FAULTS,
-    OsmosisFaults,
-)
+from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, OsmosisFaults
 from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
 

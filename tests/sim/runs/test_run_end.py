@@ -2,43 +2,33 @@
 
 from __future__ import annotations
 
-from rampart.actors.osmosis.messages import (
-    ControlPhase,
-    ControlStatus,
-    Goal,
-    MissionPhase,
-    MissionStatus,
-    Mode,
-    Twist,
-)
-from rampart.sim.osmosis.trial.mission_trial import (
-    ACCEPT_WITHIN_S,
-    LOST_AFTER_S,
-    SETTLE_S,
-    WATCH_S,
-    WORLD_LATE_S,
-    RunEnd,
-)
+from rampart.actors.osmosis import messages as m
+from rampart.sim.osmosis.trial import mission_trial as trial
+from rampart.sim.osmosis.trial.mission_trial import WATCH_S, RunEnd
 
-STANDS = Twist(0.0, 0.0)
-GOALS = (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))
+STANDS = m.Twist(0.0, 0.0)
+GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
 
 
-def mission(phase: MissionPhase, step: int = 0, mission_id: str = "m1") -> MissionStatus:
-    return MissionStatus(mission_id, "A", phase, step, GOALS, (), (), "")
+def mission(phase: m.MissionPhase = m.MissionPhase.RUNNING, step: int = 0, mission_id: str = "m1",
+            reason: str = "") -> m.MissionStatus:
+    return m.MissionStatus(mission_id, "A", phase, step, GOALS, (), (), reason)
 
 
-def going(distance_m: float) -> ControlStatus:
-    return ControlStatus("m1", 0, ControlPhase.FOLLOWING, 0, distance_m)
+LOST = mission(m.MissionPhase.IDLE, mission_id="")
+
+
+def going(distance_m: float) -> m.ControlStatus:
+    return m.ControlStatus("m1", 0, m.ControlPhase.FOLLOWING, 0, distance_m)
 
 
 def test_a_robot_is_watched_after_its_mission_until_it_stands_or_for_a_minute():
-    for twist in (Twist(0.3, 0.0), Twist(0.0, -0.5)):
+    for twist in (m.Twist(0.3, 0.0), m.Twist(0.0, -0.5)):
         end = RunEnd(60.0)
-        end.mission(mission(MissionPhase.RUNNING), 1.0)
-        end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
-        assert end.ended(9.0 + SETTLE_S - 0.1) is None
-        assert end.ended(9.0 + SETTLE_S) == "mission succeeded"
+        end.mission(mission(), 1.0)
+        end.mission(mission(m.MissionPhase.SUCCEEDED, 2), 9.0)
+        assert end.ended(9.0 + trial.SETTLE_S - 0.1) is None
+        assert end.ended(9.0 + trial.SETTLE_S) == "mission succeeded"
         end.truth(twist, 20.0)
         assert end.ended(20.0) is None
         end.truth(STANDS, 21.0)
@@ -50,89 +40,85 @@ def test_a_robot_is_watched_after_its_mission_until_it_stands_or_for_a_minute():
 def test_so_is_one_whose_mission_is_lost_was_never_taken_or_does_not_advance():
     lost, stuck, idle = (RunEnd(10.0) for _ in range(3))
     for end in (lost, stuck):
-        end.mission(mission(MissionPhase.RUNNING), 1.0)
-    lost.mission(mission(MissionPhase.IDLE, mission_id=""), 2.0)
+        end.mission(mission(), 1.0)
+    lost.mission(LOST, 2.0)
     for end, since_s, why in ((lost, 2.0, "mission lost"), (stuck, 11.0, "no progress"),
-                              (idle, ACCEPT_WITHIN_S, "no mission was accepted")):
+                              (idle, trial.ACCEPT_WITHIN_S, "no mission was accepted")):
         for now_s in (since_s + 5.0, since_s + WATCH_S - 0.1):
-            end.truth(Twist(0.3, 0.0), now_s)
+            end.truth(m.Twist(0.3, 0.0), now_s)
             assert end.ended(now_s) is None
         end.truth(STANDS, since_s + WATCH_S - 0.05)
         assert (end.ended(since_s + WATCH_S - 0.05) or "").startswith(why)
-        end.truth(Twist(0.3, 0.0), since_s + WATCH_S)
+        end.truth(m.Twist(0.3, 0.0), since_s + WATCH_S)
         assert (end.ended(since_s + WATCH_S) or "").startswith(why)
 
 
 def test_a_mission_manager_that_forgot_its_mission_ends_the_run_and_a_flicker_does_not():
     end = RunEnd(60.0)
-    end.mission(mission(MissionPhase.RUNNING), 1.0)
-    end.mission(mission(MissionPhase.IDLE, mission_id=""), 5.0)
-    end.mission(mission(MissionPhase.RUNNING), 6.0)
-    assert end.ended(5.0 + LOST_AFTER_S + 0.1) is None
-    end.mission(mission(MissionPhase.IDLE, mission_id=""), 10.0)
-    assert "mission lost" in (end.ended(10.0 + LOST_AFTER_S + 0.1) or "")
+    end.mission(mission(), 1.0)
+    end.mission(LOST, 5.0)
+    end.mission(mission(), 6.0)
+    assert end.ended(5.0 + trial.LOST_AFTER_S + 0.1) is None
+    end.mission(LOST, 10.0)
+    assert "mission lost" in (end.ended(10.0 + trial.LOST_AFTER_S + 0.1) or "")
 
 
 def test_patience_counts_from_the_last_progress_and_driving_in_circles_is_none():
     end = RunEnd(10.0)
-    end.mission(mission(MissionPhase.RUNNING), 0.0)
+    end.mission(mission(), 0.0)
     end.control(going(20.0), 1.0)
     end.control(going(19.0), 5.0)
     for t_s in range(6, 15):
         end.control(going(19.0 + t_s % 2), float(t_s))
     assert end.ended(14.9) is None
     assert end.ended(15.1) == "no progress for 10 s"
-    end.mission(mission(MissionPhase.RUNNING, step=1), 15.1)
+    end.mission(mission(step=1), 15.1)
     assert end.ended(25.0) is None
 
 
 def test_a_mission_that_a_recovery_holds_to_the_end_says_which():
     end = RunEnd(10.0)
-    held = MissionStatus("m1", "A", MissionPhase.PAUSED, 0, GOALS, (), (), "held by RM1: DM1: lost")
-    end.mission(mission(MissionPhase.RUNNING), 0.0)
-    end.mission(held, 3.0)
+    end.mission(mission(), 0.0)
+    end.mission(mission(m.MissionPhase.PAUSED, reason="held by RM1: DM1: lost"), 3.0)
     assert end.ended(10.1) == "no progress for 10 s: mission paused, held by RM1: DM1: lost"
 
 
 def test_a_mission_of_the_operator_is_waited_for_and_one_that_nobody_takes_or_a_lost_world_is_not():
     end = RunEnd(10.0, waits=True)
     assert end.ended(10_000.0) is None
-    end.mission(mission(MissionPhase.RUNNING), 10_000.0)
+    end.mission(mission(), 10_000.0)
     assert end.ended(10_009.9) is None
     assert end.ended(10_010.1) == "no progress for 10 s"
-    assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
-    assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
+    assert RunEnd(100.0).ended(trial.ACCEPT_WITHIN_S) is None
+    assert "no mission was accepted" in (RunEnd(100.0).ended(trial.ACCEPT_WITHIN_S + 0.1) or "")
     late = RunEnd(60.0, begins_s=500.0)  # a part of a resumed run
     assert late.ended(529.0) is None
     assert "no mission was accepted" in str(late.ended(532.0))
     end.truth(STANDS, 10_012.0)
-    assert end.world_gone(10_012.0 + WORLD_LATE_S) == ""
-    assert "the world is gone" in end.world_gone(10_012.1 + WORLD_LATE_S)
+    assert end.world_gone(10_012.0 + trial.WORLD_LATE_S) == ""
+    assert "the world is gone" in end.world_gone(10_012.1 + trial.WORLD_LATE_S)
 
 
 def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_anew():
-    def status(reason: str) -> MissionStatus:
-        return MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), reason)
-
     end = RunEnd(10.0)
-    end.mission(status(""), 0.0)
+    end.mission(mission(), 0.0)
     end.control(going(20.0), 1.0)
-    end.mission(status("way round (3, 4)"), 9.0)
+    end.mission(mission(reason="way round (3, 4)"), 9.0)
     end.control(going(60.0), 9.1)
     end.control(going(50.0), 17.0)
-    end.mission(status("way round (3, 4)"), 26.0)
+    end.mission(mission(reason="way round (3, 4)"), 26.0)
     assert end.ended(26.9) is None
     assert end.ended(27.1) == "no progress for 10 s"
     for number in range(100):
-        end.mission(status(f"way round ({number}, 4)"), 30.0 + number)
+        end.mission(mission(reason=f"way round ({number}, 4)"), 30.0 + number)
     assert end.ended(60.0) == "no progress for 10 s", "to and fro is no progress"
 
 
 def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
     end = RunEnd(patience_s=40.0)
-    end.mission(mission(MissionPhase.RUNNING), 0.0)
-    for phase in (ControlPhase.IDLE, ControlPhase.WAITING, ControlPhase.ARRIVED):
-        end.control(ControlStatus("m1", 0, phase, 0, 0.0), 0.1)
+    end.mission(mission(), 0.0)
+    for phase in (m.ControlPhase.IDLE, m.ControlPhase.WAITING, m.ControlPhase.ARRIVED):
+        end.control(m.ControlStatus("m1", 0, phase, 0, 0.0), 0.1)
     end.control(going(30.0), 1.0)
     end.control(going(20.0), 35.0)
     assert end.ended(60.0) is None

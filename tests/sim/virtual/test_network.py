@@ -8,12 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rampart.sim.virtual.network import (
-    NETWORKS,
-    NetworkModel,
-    SeededNetwork,
-    Timing,
-)
+from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork, Timing
 
 
 def ways(network: SeededNetwork, count: int = 4000, step_s: float = 0.001):
