@@ -12,7 +12,7 @@ from typing import Any
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.system.layout import published_keys
 from rampart.cli import systems
-from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
+from rampart.sim.faults.faults import faults_of
 
 
 def nodes(**_: Any) -> list[str]:
@@ -28,9 +28,8 @@ def topics(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
 
 
 def faults(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Return the named faults of the run, or of the shipped system, and those of processes."""
+    """Return the named faults of the run, or of the shipped system."""
     with contextlib.suppress(ValueError):
         known = faults_of(systems.at_hand(None, getattr(parsed_args, "port", None)))
-        return [*known.named, *(fault.name for fault in known.offered()),
-                *(f"{kind}:{node}" for kind in PROCESS_FAULTS for node in nodes())]
+        return [*known.named, *(fault.name for fault in known.offered())]
     return []

@@ -43,36 +43,28 @@ async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
     return False
 
 
-async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, option: str = "--port"
-                   ) -> AsyncGenerator[Session, None]:
-    """Yield a session of the run and, if `follow`, of each later run.
+async def sessions(port: int | None, stop: asyncio.Event) -> AsyncGenerator[Session, None]:
+    """Wait for a run and yield its session, and that of each later run.
 
     The body of the caller's loop ends when `is_over` or `stop` is true.
 
     Args:
-        port: base port of the run; None for the only one.
+        port: base port of the run, by `--run`; None for the only one.
         stop: ends the iteration.
-        follow: wait for a run if there is none, and for the next.
-        option: name of the verb's option for the base port.
 
     Raises:
-        UsageError: there is no run and `follow` is not set, or there are several.
-        NoEffectError: the routers of the run send no messages, and `follow` is not set.
+        UsageError: there are several runs, and no port.
     """
-    while not follow or await wait_for_run(port, stop):
+    while await wait_for_run(port, stop):
         try:
             async with connect(port) as session:
                 yield session
         except UsageError as error:
-            if not follow or len(find_runs()) > 1:
-                raise UsageError(str(error).replace("--port", option)) from None
+            if len(find_runs()) > 1:
+                raise UsageError(str(error).replace("--port", "--run")) from None
         except NoEffectError as error:
-            if not follow:
-                raise
             warn(str(error))
             await pause(stop, _AGAIN_S)
-        if not follow:
-            return
 
 
 @contextlib.contextmanager

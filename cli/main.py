@@ -134,7 +134,7 @@ def _run(arguments: Sequence[str]) -> int:
     working_folder.admit()  # for the user's actors, as in the processes of a run
     try:
         if arguments[:1] == ["campaign"]:
-            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 others need no campaigns
+            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 others need no physics
 
             options = campaign_verb.parse(arguments[1:])
         else:

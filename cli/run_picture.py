@@ -18,7 +18,7 @@ from rampart.cli.robot_lines import SILENT, RobotLines
 
 DECODED: tuple[Topic[Any], ...] = (
     ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
-    ftm_topics.NODES, ftm_topics.PROCESS_EVENT)
+    ftm_topics.NODES)
 """Topics that are decoded besides those of the robot's lines; others are only counted."""
 
 STALE_S = 2.0
@@ -30,11 +30,9 @@ _NAMES = 1024
 _OTHERS = "others"
 
 
-def _count(counter: Counter[Any], key: Any) -> None:
+def _count(counter: Counter[str], name: str) -> None:
     """Count for a name, or for `others` beyond the greatest number of names."""
-    if key not in counter and len(counter) >= _NAMES:
-        key = (_OTHERS,) * len(key) if isinstance(key, tuple) else _OTHERS
-    counter[key] += 1
+    counter[name if name in counter or len(counter) < _NAMES else _OTHERS] += 1
 
 
 def _report(module: str, report: Any, busy: StrEnum, newest: dict[str, Any],
@@ -58,7 +56,6 @@ class RunPicture:
         decisions_total: number of decisions by strategy.
         detections_total: number of times that each module became active.
         recoveries_total: number of times that each recovery became activated.
-        process_events_total: number of process events by node and event.
     """
 
     def __init__(self, lines: RobotLines | None = None) -> None:
@@ -70,7 +67,6 @@ class RunPicture:
         self.decisions_total: Counter[str] = Counter()
         self.detections_total: Counter[str] = Counter()
         self.recoveries_total: Counter[str] = Counter()
-        self.process_events_total: Counter[tuple[str, str]] = Counter()
         self._latest: dict[str, tuple[Any, float]] = {}
         self._samples: deque[tuple[float, Counter[str]]] = deque(maxlen=_SAMPLES)
 
@@ -90,8 +86,6 @@ class RunPicture:
         elif topic is ftm_topics.DECISION:
             self.decisions.append((header.stamp, body))
             _count(self.decisions_total, body.strategy)
-        elif topic is ftm_topics.PROCESS_EVENT:
-            _count(self.process_events_total, (body.node, body.event))
         else:
             self._latest[topic.key] = (body, now_s)
 

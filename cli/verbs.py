@@ -117,8 +117,6 @@ def port_option(name: str, text: str, otherwise: int | None = None, **fields: An
 
 PORT = port_option("--port", _WHICH_RUN, metavar="N")
 JSON = flag("--json", "print JSON")
-JSON_FORMAT = option("--json", action="store_const", dest="format", const="json",
-                     help="same as --format json")
 
 
 def served(port: int, what: str) -> tuple[Option, ...]:

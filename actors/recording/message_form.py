@@ -116,22 +116,6 @@ class MessageForm:
             return False
 
 
-def renumbered(payload: bytes, restarts: int, later_s: float) -> bytes:
-    """Return a payload with a later incarnation and stamp; garbage stays as it is.
-
-    Args:
-        payload: bytes that were sent.
-        restarts: added to the incarnation.
-        later_s: added to the stamp, simulated seconds.
-    """
-    try:
-        message = _any_message.decode(payload)
-        return _encode_msgpack((message.source, message.incarnation + restarts, message.sequence,
-                                message.stamp + later_s, message.body))
-    except (*UNREADABLE, OverflowError):  # the incarnation is the largest number already
-        return payload
-
-
 def header_of(payload: bytes) -> Header | None:
     """Return the header of a payload, or None for garbage."""
     try:

@@ -8,13 +8,11 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.foreign.program import wrong_programs
-from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.process_title import POOL, RUN
 from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
-from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.output import print_json, print_table, say, warn
 from rampart.cli.verbs import JSON, add_verb, flag
 from rampart.manager.analysis.pairs import Pair, pairs
@@ -33,23 +31,6 @@ class Process(msgspec.Struct, frozen=True):
     nodes: dict[str, str]
     kind: str
     brought_back_by: str
-
-
-class Talk(msgspec.Struct, frozen=True):
-    """A topic between nodes, with publishers and readers."""
-
-    topic: str
-    message: str
-    from_: tuple[str, ...] = msgspec.field(name="from")
-    to: tuple[str, ...]
-
-
-class Guard(msgspec.Struct, frozen=True):
-    """A part that notices that others are dead, stopped or hung."""
-
-    by: str
-    of: tuple[str, ...]
-    does: str
 
 
 class Consequence(msgspec.Struct, frozen=True):
@@ -85,8 +66,6 @@ class Explanation(msgspec.Struct, frozen=True):
     title: str
     strategy: str
     processes: tuple[Process, ...]
-    talks: tuple[Talk, ...]
-    guards: tuple[Guard, ...]
     consequences: tuple[Consequence, ...]
 
 
@@ -94,7 +73,7 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     add_verb(verbs, "check", "check a system without running it", check,
              systems.choice(), JSON)
-    add_verb(verbs, "explain", "list processes, topics and consequences of detections", run,
+    add_verb(verbs, "explain", "list processes and consequences of detections", run,
              systems.choice(), flag("--pairs", "list what is decided for each ordered pair of "
                                     "mechanisms, and what stays when one of them clears"), JSON)
 
@@ -102,10 +81,10 @@ def add(verbs: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Explain a system.
 
-    Describe a system: its processes and their actors, publishers and readers of
-    each topic, which part watches and restarts which, and the consequence of each
-    detection. That is: its mechanisms, the recovery that is chosen if nothing else
-    is active, and the next one if that fails.
+    Describe a system: its processes, their actors and which part restarts them, and
+    the consequence of each detection. That is: its mechanisms, the recovery that is
+    chosen if nothing else is active, and the next one if that fails. `rampart topic
+    info` lists publishers and readers of a topic.
 
     Examples:
       rampart explain
@@ -136,7 +115,7 @@ def explain(layout: Layout) -> Explanation:
     spec = layout.spec
     return Explanation(
         spec.name, spec.title, spec.strategy, tuple(_processes(layout)),
-        tuple(_talks(spec)), tuple(_guards(layout)), tuple(_consequences(spec)))
+        tuple(_consequences(spec)))
 
 
 def _processes(layout: Layout) -> Iterator[Process]:
@@ -153,32 +132,6 @@ def _respawner(layout: Layout, unit: Unit) -> str:
     """Return the part that restarts a process; the world is not restarted."""
     ours = unit.kind != Kind.WORLD.value and layout.spec.layers.supervisor_respawn
     return unit.respawn if unit.respawn != SUPERVISOR or ours else ""
-
-
-def _talks(spec: SystemSpec) -> Iterator[Talk]:
-    for use in catalogue.uses(spec):
-        readers = tuple(name for name in use.readers if name != OBSERVER)
-        publishers = use.publishers
-        if publishers == ("tools",) and not use.topic.outside:
-            publishers = ()  # an optional input
-        if readers in {(), (SUPERVISOR,)} or "every node" in (*publishers, *readers):
-            continue
-        yield Talk(use.topic.key, use.topic.type.__name__, publishers, readers)
-
-
-def _guards(layout: Layout) -> Iterator[Guard]:
-    yield Guard(_ROOT, (SUPERVISOR, POOL), "restarts it")
-    by: dict[str, list[str]] = {SUPERVISOR: list(layout.routers)}
-    for unit in layout.units.values():
-        by.setdefault(_respawner(layout, unit), []).append(unit.name)
-    by.pop("", None)
-    for name, units in by.items():
-        yield Guard(name, tuple(units), "restarts it" if name == SUPERVISOR
-                    else "requests its restart, if the manager activates it")
-    for member in layout.members.values():
-        if isinstance(member.parameters, Watchdog.Parameters):
-            yield Guard(member.name, member.parameters.watch,
-                        "detects that it is dead, stopped or hung")
 
 
 def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
@@ -239,15 +192,6 @@ def _show(found: Explanation) -> None:
         (p.name, p.kind, p.brought_back_by or "-", ", ".join(
             f"{name} ({actor.partition(':')[2] or 'command'})" for name, actor in p.nodes.items()))
         for p in found.processes])
-    say()
-    say(f"{len(found.talks)} topics")
-    print_table(("topic", "from", "to"), [
-        (talk.topic, ", ".join(talk.from_) or "-", ", ".join(talk.to))
-        for talk in found.talks])
-    say()
-    say("Supervision")
-    for guard in found.guards:
-        say(f"  {guard.by}: {', '.join(guard.of)}: {guard.does}")
     say()
     say("Consequence of each detection, if no other module detects anything")
     for each in found.consequences:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.ftm import messages as m
-from rampart.actors.ftm import topics
 from rampart.cli import systems
 from rampart.cli.output import (
     NoEffectError,
@@ -22,31 +19,27 @@ from rampart.cli.output import (
     using,
     warn,
 )
-from rampart.cli.session import connect
-from rampart.cli.verbs import JSON, PORT, add_verb, flag, option, whole, word
+from rampart.cli.verbs import JSON, add_verb, flag, option, whole, word
 from rampart.files.reading import read_bytes
 from rampart.manager.analysis.barriers import Guarded, guard, outlook
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
-from rampart.manager.analysis.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.analysis.open_psa import MAX_BYTES, read_open_psa, write_open_psa
 from rampart.manager.spec.schema import SystemSpec
 
 _LIMIT = 100
-_WAIT_S = 1.0
 
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "cut-sets", "find minimal cut sets and their barriers", run,
-             PORT, systems.choice("file", ", or Open-PSA file .xml"),
+             systems.choice("file", ", or Open-PSA file .xml"),
              flag("--count", "print only the number of sets"),
              word("--top", "GATE", "top gate of an Open-PSA file", ""),
              whole("--max-order", "K", "leave out sets with more than K events"),
-             flag("--strict", "refuse an Open-PSA file that causes a warning"),
              whole("--limit", "N", f"list at most N sets (default: {_LIMIT})", _LIMIT),
              option("--active", nargs="+", default=[], metavar="FTM",
                     help="show what is left before the top if these mechanisms are active"),
-             flag("--live", "show what is left before the top in the run, now"),
              word("--export", "FILE", "write the fault tree in Open-PSA format"), JSON)
 
 
@@ -64,15 +57,12 @@ def run(options: argparse.Namespace) -> int:
       rampart cut-sets plant.xml --count --json     # an Open-PSA file
       rampart cut-sets plant.xml --top g12 --max-order 2
       rampart cut-sets --active FTM2                # what is left if FTM2 is active
-      rampart cut-sets --live                       # what is left in the run, now
       rampart cut-sets --export osmosis.xml         # for other tools
     """
     for name in ("limit", "max_order"):
         if (getattr(options, name) or 0) < 0:
             raise UsageError(f"--{name.replace('_', '-')} {getattr(options, name)}: must be 0 or "
                              "more")
-    if options.live:
-        return asyncio.run(_live(options))
     spec, formula = _load(options)
     if options.active or options.export:
         if spec is None:
@@ -100,20 +90,12 @@ def _of_order(options: argparse.Namespace) -> str:
     return "" if options.max_order is None else f" of at most {options.max_order} events"
 
 
-def _refuse(doubt: OpenPsaError) -> None:
-    raise doubt
-
-
-def _warn(doubt: OpenPsaError) -> None:
-    warn(str(doubt))
-
-
 def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
     if options.file and options.file.lower().endswith(".xml"):
         with using(options.file):
             text = read_bytes(Path(options.file), MAX_BYTES)
             return None, read_open_psa(text, options.file, options.top,
-                                       _refuse if options.strict else _warn)
+                                       lambda doubt: warn(str(doubt)))
     spec = systems.load(options.file)
     try:
         formula = formula_of(spec.build_fault_tree())
@@ -178,14 +160,3 @@ def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
 def _print_barriers(events: str, guarded: Iterable[Guarded]) -> None:
     print_table(("barriers", events, "mechanisms, nearest to the top first"),
                 [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
-
-
-async def _live(options: argparse.Namespace) -> int:
-    async with connect(options.port) as session:
-        spec = systems.load(session.run.system_file)
-        heard = await session.latest((topics.MANAGER_STATUS,), session.real_s(_WAIT_S))
-    status: m.ManagerStatus | None = heard.get(topics.MANAGER_STATUS.key)
-    if status is None:
-        raise NoEffectError("the FTM Manager does not answer; try again when it is back")
-    known = {mechanism.name for mechanism in spec.mechanisms}
-    return _show_outlook(spec, [n for n in status.active if n in known], as_json=options.json)

@@ -8,8 +8,8 @@ from collections.abc import Collection
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import positive, print_json, print_table, progress, say
-from rampart.cli.verbs import JSON, add_verb, flag, several, whole
+from rampart.cli.output import print_json, print_table, progress, say
+from rampart.cli.verbs import JSON, add_verb, flag, several
 from rampart.manager.analysis.verification import MEANING, Report, verify
 from rampart.manager.spec.schema import SystemSpec
 
@@ -18,8 +18,6 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "verify", "verify the arbitration exhaustively", run, systems.choice(),
              several("--strategy", "NAME", "verify only this strategy; repeatable (default: all)"),
-             whole("--together", "K", "explore K recoveries at a time (default: 2, which is "
-                   "sufficient; all recoveries of the system take minutes)", 2),
              flag("--strict", "exit with 1 if a property fails"), JSON)
 
 
@@ -44,11 +42,10 @@ def run(options: argparse.Namespace) -> int:
     usage or unsound system
     """
     spec = systems.check(options.system).spec
-    positive("--together", options.together)
     wanted = set(options.strategy or [spec.strategy]) | {""}
     start = time.monotonic()
     with progress() as show:
-        report = verify(spec, options.strategy, options.together, show)
+        report = verify(spec, options.strategy, progress=show)
     if options.json:
         print_json(report)
     else:

@@ -96,8 +96,7 @@ async def live(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     try:
         with stopped_by_signals(stop):
-            async with contextlib.aclosing(sessions(
-                    options.of, stop, follow=True, option="--run")) as found:
+            async with contextlib.aclosing(sessions(options.of, stop)) as found:
                 async for session in found:
                     _watch(session, viewer)
                     say(f"showing {session.run.title} (port {session.run.base_port})")

@@ -1,8 +1,8 @@
 """`rampart live metrics`: a picture of the run as Prometheus metric families, and their server.
 
 Names follow Prometheus' practice: base units, and `_total` for counters. Times are simulated
-seconds, except processor time. Messages, process events, decisions, detections and recoveries count
-from the exporter's start; the other counters are those of the run or of an incarnation. The
+seconds, except processor time. Messages, decisions, detections and recoveries count from the
+exporter's start; the other counters are those of the run or of an incarnation. The
 function `rate()` of Prometheus handles the reset at the next run or incarnation.
 
 The server follows runs, and answers scrapes. Both happen on one event loop, so no message changes
@@ -93,27 +93,22 @@ def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: Iterable[Row]
 def _nodes(now: Exposition) -> Iterator[Metric]:
     table: fm.NodeTable | None = now.picture.latest(ftm_topics.NODES)
     nodes = table.nodes if table else ()
-    beats = [n for n in nodes if n.heard_s]
     yield gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
         ((n.name, n.kind), float(n.state is fm.NodeState.RUNNING)) for n in nodes])
-    yield gauge("node_incarnation", "Number of a node's present incarnation.", ("node",), [
-        ((n.name,), n.incarnation) for n in nodes])
     yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
+    beats = [n for n in nodes if n.heard_s]
     yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
                 ("node",), [((n.name,), max(0.0, now.time_s - n.heard_s)) for n in beats])
     yield counter("rejected_payloads", "Payloads that this incarnation of a node refused.",
                   ("node",), [((n.name,), n.rejected_payloads) for n in beats])
     yield counter("overflowed_commands", "Commands lost because the mailbox of a node was full.",
                   ("node",), [((n.name,), n.overflowed) for n in beats])
-    yield counter("process_events", "Events of processes.", ("node", "event"),
-                  sorted(now.picture.process_events_total.items()))
 
 
 def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
     detections = sorted(picture.detections.items())
     recoveries = sorted(picture.recoveries.items())
-    manager: fm.ManagerStatus | None = picture.latest(ftm_topics.MANAGER_STATUS)
     yield gauge("detection_active", "Whether a module detects.", ("module",), [
         ((name,), float(report.state is fm.DetectionState.ACTIVE)) for name, report in detections])
     yield counter("detections", "How often a module began to detect.", ("module",), [
@@ -125,19 +120,12 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
         ((name,), picture.recoveries_total[name]) for name, _ in recoveries])
     yield counter("decisions", "Decisions of the FTM Manager.", ("strategy",), [
         ((name,), count) for name, count in sorted(picture.decisions_total.items())])
-    if manager is not None:
-        yield gauge("recovery_latched", "Recoveries that stay in force until a reset.", (), [
-            ((), len(manager.latched))])
-        yield InfoMetricFamily("rampart_strategy", "Strategy in force.",
-                               value={"strategy": manager.strategy})
 
 
 def _traffic_and_load(now: Exposition) -> Iterator[Metric]:
     found = sorted(now.processes.items())
     yield counter("messages", "Messages by topic, with all members of a family.", ("topic",), [
         ((key,), count) for key, count in sorted(now.picture.messages.items())])
-    yield gauge("message_rate_hertz", "Messages per simulated second, over the last seconds.",
-                ("topic",), [((key,), hz) for key, hz in now.picture.rates().items()])
     yield counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
         ((name,), count.cpu_s) for name, count in found])
     yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
@@ -172,7 +160,7 @@ class Exporter:
 
     async def follow(self, port: int | None, stop: asyncio.Event) -> None:
         """Follow one run after the other until `stop`."""
-        async with contextlib.aclosing(sessions(port, stop, follow=True, option="--run")) as found:
+        async with contextlib.aclosing(sessions(port, stop)) as found:
             async for session in found:
                 self._watch = Watch(session)
                 while not stop.is_set() and not is_over(session.run):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import math
 import shutil
 import sys
@@ -20,11 +19,11 @@ from rich.text import Text
 from rampart.actors.bus import run_info
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
+from rampart.cli.following import LOOK_S, Watch, is_over, stopped_by_signals
 from rampart.cli.output import print_json, say
 from rampart.cli.robot_lines import Row
 from rampart.cli.run_picture import RunPicture, manager_in_words
-from rampart.cli.session import pause
+from rampart.cli.session import connect, pause
 from rampart.cli.terminal import END, keys
 from rampart.files.plain_text import printable
 from rampart.manager.strategies.registry import decision_in_words
@@ -69,18 +68,13 @@ async def top(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     live = not (options.once or options.json) and sys.stdout.isatty()
     with stopped_by_signals(stop):
-        async with contextlib.aclosing(
-                sessions(options.port, stop, follow=options.follow)) as found:
-            async for session in found:
-                watch = Watch(session)
-                if not live:
-                    return await _once(watch, options, stop)
-                await _live(watch, stop)
-                if stop.is_set():
-                    break
+        async with connect(options.port) as session:
+            watch = Watch(session)
+            if not live:
+                return await _once(watch, options, stop)
+            await _live(watch, stop)
+            if not stop.is_set():
                 say(f"the run has ended: {session.run.title} (port {session.run.base_port})")
-                if options.follow:
-                    say("waiting for the next one; Ctrl-C ends")
     return 0
 
 

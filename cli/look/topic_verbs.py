@@ -1,12 +1,11 @@
 """`rampart topic`: the topics of a system and their messages.
 
-List, print and measure topics. KEY is a key as `rampart topic list` shows it. For
+List and print topics. KEY is a key as `rampart topic list` shows it. For
 a family use detection/DM1 for one member, or 'detection/*' for all.
 
 Examples:
   rampart topic list
   rampart topic echo KEY -n 3
-  rampart topic hz KEY
   rampart topic info KEY
 """
 
@@ -16,39 +15,29 @@ import argparse
 import asyncio
 import itertools
 import math
-import statistics
-from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
-from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.look.topic_catalogue import (
-    check_member,
-    resolve,
-    topics_for,
-)
+from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
 from rampart.cli.output import NoEffectError, positive, print_json, print_rows, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
 
-_WINDOW = 500
 _SHOWN_BYTES = 24
-_HZ_REPORT_S = 1.0
 
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topic = add_family(verbs, "topic", "list, print and measure topics", __doc__)
+    topic = add_family(verbs, "topic", "list and print topics", __doc__)
     key = option("key", metavar="KEY", completer=completion.topics, help="key of a topic")
     add_verb(topic, "list", "list all topics; needs no run", topic_list,
              systems.choice(default="that of the run, else osmosis"),
@@ -60,9 +49,6 @@ def add(verbs: Any) -> None:
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
              flag("--json", "print one JSON object per line"))
-    add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
-             number("--duration", "S", "end after S real seconds (default with --json: 3)"),
-             flag("--json", "print JSON at the end"))
 
 
 def topic_list(options: argparse.Namespace) -> int:
@@ -162,46 +148,6 @@ async def topic_echo(options: argparse.Namespace) -> int:
     return 0
 
 
-async def topic_hz(options: argparse.Namespace) -> int:
-    """Measure rates.
-
-    Measure how often messages arrive, in simulated time like the nominal rate.
-    Print the rate of the last 500 messages each second, until the run ends or
-    Ctrl-C.
-
-    Examples:
-      rampart topic hz control/command
-      rampart topic hz 'heartbeat/*' --duration 3 --json
-    """
-    positive("--duration", options.duration)
-    topic, key = resolve(options.key, topics_for(options.key, options.port))
-    arrivals: Remembered[str, deque[float]] = Remembered(MANY)
-    duration_s = options.duration or (3.0 if options.json else None)
-    async with connect(options.port) as session:
-        check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
-
-        def heard(short: str, _header: Header, _body: Any) -> None:
-            times = arrivals.get(short)
-            if times is None:
-                times = arrivals[short] = deque(maxlen=_WINDOW)
-            times.append(session.clock.now())
-
-        session.listen(topic, heard, key)
-        async for left in _while_it_runs(session, duration_s):
-            await asyncio.sleep(min(_HZ_REPORT_S, left))
-            if not options.json:
-                for short in sorted(arrivals):
-                    print_rate(short, rate_of(list(arrivals[short])))
-                if not arrivals:
-                    say(f"no message on {options.key} yet")
-    if options.json:
-        print_json([{"key": short, "nominal_hz": topic.rate_hz, **rate_of(list(times))}
-                    for short, times in sorted(arrivals.items())])
-    if not arrivals:
-        raise _nothing_came(options.key, duration_s)
-    return 0
-
-
 async def _while_it_runs(session: Session, duration_s: float | None) -> AsyncIterator[float]:
     """Yield the real seconds that are left, until the end of time, run or reader."""
     loop = asyncio.get_running_loop()
@@ -224,19 +170,6 @@ def _describe(use: catalogue.TopicUse) -> dict[str, Any]:
             "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}
 
 
-def rate_of(times_s: list[float]) -> dict[str, Any]:
-    """Return rate and spread of arrival times, as `ros2 topic hz` does."""
-    gaps = [b - a for a, b in itertools.pairwise(times_s)]
-    if not gaps:
-        return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
-                "window": len(times_s)}
-    mean = statistics.fmean(gaps)
-    return {
-        "rate_hz": 1 / mean if mean > 0 else None, "min_s": min(gaps), "max_s": max(gaps),
-        "std_dev_s": statistics.pstdev(gaps), "window": len(times_s),
-    }
-
-
 def in_line(body: Any) -> str:
     """Return a message as one line of JSON, with the length of bytes instead of the bytes."""
     plain = msgspec.to_builtins(body, builtin_types=(bytes,))
@@ -251,12 +184,3 @@ def in_line(body: Any) -> str:
         return value
 
     return msgspec.json.encode(shorten(plain)).decode()
-
-
-def print_rate(key: str, rate: dict[str, Any]) -> None:
-    """Print a result of `rate_of`."""
-    if rate["rate_hz"] is None:
-        say(f"{key}: one message so far")
-        return
-    say(f"{key}: average rate: {rate['rate_hz']:.3f} min: {rate['min_s']:.3f}s "
-        f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")

@@ -1,32 +1,24 @@
-"""`rampart inject`: inject a fault of the catalogue, or one that the options describe."""
+"""`rampart inject`: inject a fault of the catalogue, or disturb any topic."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import math
 import uuid
 from collections.abc import Coroutine, Sequence
 from typing import Any
 
-import msgspec
-
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
-from rampart.actors.bus.run_info import find_run
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.runtime.corruption import field_type, is_array
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.actors.runtime.injection import MODES, flaw
-from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
-from rampart.cli.operate.kill_node import signal_anywhere
 from rampart.cli.operate.operator_verbs import trigger
 from rampart.cli.output import (
     NoEffectError,
@@ -37,28 +29,20 @@ from rampart.cli.output import (
     say,
 )
 from rampart.cli.session import Session, connect, pause
-from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
-_SECONDS = "must be seconds above 0"
-_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt", "add": "corrupt",
-            "ramp": "corrupt", "noise": "corrupt"}
-"""Option → the mode that it details."""
-
-STOPPED_S = 5.0
-"""Simulated seconds for which `stop:NODE` stops a process by default."""
+_OF_TOPICS = ("share", "on", "off", "seed", "add", "ramp", "noise")
+"""Options of a fault of a topic."""
 
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, also during its restart."""
-
-_OF_TOPICS = ("share", "on", "off", "seed", *_DETAILS)
-"""Options of a fault of a topic."""
 
 
 def add(verbs: Any) -> None:
@@ -66,32 +50,24 @@ def add(verbs: Any) -> None:
     add_verb(
         verbs, "inject", "inject a fault", inject, PORT,
         option("fault", nargs="?", metavar="FAULT", completer=completion.faults,
-               help="a name from --list, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE or "
-               f"trigger:MODULE; MODE is {', '.join(MODES)}, or a nonsense reading of --list"),
+               help=f"a name from --list, MODE:TOPIC or trigger:MODULE; MODE is "
+               f"{', '.join(MODES)}, or a nonsense reading of --list"),
         flag("--list", "list the faults of the system; needs no run"),
         word("--system", "FILE", "for --list: system file (default: that of the run, else "
              "osmosis)"),
         number("--duration", "S", "duration in simulated seconds, inf for permanent (default: that "
                f"of the fault, else {_DEFAULT_DURATION_S:g})"),
-        flag("--at-once", "return when the fault is in force, instead of at its end"),
-        JSON,
-        group("which messages",
-              number("--share", "P", "probability that a message is affected (default: 1)"),
-              number("--on", "S", "with --off: in force for S, repeatedly"),
-              number("--off", "S", "with --on: then absent for S"),
-              option("--seed", type=int, metavar="N", help="seed of random choices: share, "
-                     "noise, and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
-        group("details of MODE:TOPIC",
-              number("--delay", "S", "delay: simulated seconds (default: 1.5)"),
-              number("--stamp", "S", "restamp: simulated seconds that are added to each stamp "
-                     "(default: random)"),
-              several("--set", "FIELD=VALUE",
-                      "corrupt: overwrite a field; repeatable, as all below"),
-              several("--add", "FIELD=BIAS",
-                      "corrupt: add BIAS to a number, or to each number of an array"),
-              several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
-              several("--noise", "FIELD=SIGMA",
-                      "corrupt: add Gaussian noise of this standard deviation")))
+        number("--share", "P", "probability that a message is affected (default: 1)"),
+        whole("--seed", "N", "seed of random choices: share, noise, and values of restamp:TOPIC "
+              "and corrupt:TOPIC (default: 0)"),
+        number("--on", "S", "with --off: in force for S, repeatedly"),
+        number("--off", "S", "with --on: then absent for S"),
+        several("--add", "FIELD=BIAS", "corrupt:TOPIC: add BIAS to a number, or to each number of "
+                "an array; repeatable, as all below"),
+        several("--ramp", "FIELD=RATE", "corrupt:TOPIC: add RATE per simulated second"),
+        several("--noise", "FIELD=SIGMA", "corrupt:TOPIC: add Gaussian noise of this standard "
+                "deviation"),
+        JSON)
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
@@ -107,14 +83,12 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
       rampart inject --list                           # the faults of the system
       rampart inject FAULT --duration 3
       rampart inject stuck:TOPIC --duration inf       # until the node's process ends
-      rampart inject drop:TOPIC --share 0.3           # lose three messages in ten
       rampart inject corrupt:TOPIC --seed 7           # odd seed: one number; even: all
-      rampart inject corrupt:TOPIC --set pose.x_m=2.5
-      rampart inject restamp:TOPIC --stamp=-0.2       # stamps 0.2 s too early
-      rampart inject stop:NODE --duration 2           # freeze a process for 2 s
+      rampart inject corrupt:TOPIC --ramp pose.x_m=0.5
       rampart inject trigger:MODULE                   # a stand-in detection module detects
 
-    `rampart topic info TOPIC` lists the fields.
+    `kill-node` kills, stops and hangs processes. A [[fault]] of the specification is a
+    fault with your own values.
 
     exit code: 0 it had an effect, 1 it had none, 2 bad usage
     """
@@ -127,7 +101,8 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     if not options.fault:
         raise UsageError("expected FAULT; `rampart inject --list` lists the faults")
     if options.fault.partition(":")[0] in PROCESS_FAULTS:
-        return _hit_process(options)
+        raise UsageError(f"{options.fault}: only from the start of a run, by --fault; now "
+                         "`kill-node NODE --signal KILL`, STOP or WEDGE does it")
     if options.fault.startswith(TRIGGER):
         return trigger(argparse.Namespace(
             port=options.port, module=options.fault.removeprefix(TRIGGER),
@@ -144,10 +119,13 @@ def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
         UsageError: there is no such fault, or an option does not fit it.
     """
     unique = uuid.uuid4().hex[:6]
-    own = faults_of(systems.at_hand(None, options.port)).own(
-        options.fault, f"{options.fault}-{unique}", options.duration)
+    faults = faults_of(systems.at_hand(None, options.port))
+    own = faults.own(options.fault, f"{options.fault}-{unique}", options.duration)
     if own is not None:
-        _refuse_details(options)
+        for name in _OF_TOPICS:
+            if getattr(options, name) not in (None, []):
+                raise UsageError(f"--{name}: only with a fault of a topic, not with "
+                                 f"{options.fault}")
         if not isinstance(own, tuple):
             raise UsageError(f"{options.fault}: can only be injected from the start of a run: "
                              f"--fault {options.fault}@SECONDS")
@@ -168,69 +146,40 @@ def choose(options: argparse.Namespace) -> Fault:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
     if (options.on is None) != (options.off is None):
         raise UsageError("--on S and --off S: expected both or none")
-    positive("--on", options.on, _SECONDS, math.inf)
-    positive("--off", options.off, _SECONDS, math.inf)
+    for name, value in (("--on", options.on), ("--off", options.off)):
+        positive(name, value, "must be seconds above 0", math.inf)
     mode, colon, key = options.fault.partition(":")
-    detailed = [name for name in _DETAILS if getattr(options, name) not in (None, [])]
-    for name in detailed:
-        if not colon or mode != _DETAILS[name]:
-            raise UsageError(f"--{name}: only with {_DETAILS[name]}:TOPIC, not with "
-                             f"{options.fault}")
     known = topics_for(key, options.port) if colon else ()
-    if detailed:
-        fault = _detailed(mode, key, known, options)
+    if options.add or options.ramp or options.noise:
+        if mode != "corrupt":
+            raise UsageError(f"--add, --ramp, --noise: only with corrupt:TOPIC, not with "
+                             f"{options.fault}")
+        fault = _corruption(*resolve(key, known), options)
     else:
-        fault = faults_of(systems.at_hand(None, options.port)).find(
-            options.fault, options.seed or 0, known)
+        faults = faults_of(systems.at_hand(None, options.port))
+        fault = faults.find(options.fault, options.seed or 0, known)
     return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
 
-def _detailed(mode: str, name: str, known: Sequence[Topic[Any]], options: argparse.Namespace
-              ) -> Fault:
-    topic, key = resolve(name, known)
-    positive("--delay", options.delay, _SECONDS, math.inf)
-    disturbance = Disturbance(
-        key.removeprefix(f"{ROOT}/"), mode, options.delay or 0.0,
-        set_fields=dict(_setting(text, topic) for text in options.set),
-        add_fields=dict(_amount("--add", text, topic) for text in options.add),
-        ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
-        noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
-        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
-    if reason := flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type):
+def _corruption(topic: Topic[Any], key: str, options: argparse.Namespace) -> Fault:
+    change = Disturbance(
+        key.removeprefix(f"{ROOT}/"), "corrupt", seed=options.seed or 0,
+        add_fields=_amounts("--add", options.add), ramp_fields=_amounts("--ramp", options.ramp),
+        noise_fields=_amounts("--noise", options.noise))
+    if reason := flaw(change.order("", _DEFAULT_DURATION_S), topic.type):
         raise UsageError(f"{options.fault}: {reason}")
-    return Fault(f"{mode}:{disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
+    return Fault(f"corrupt:{change.topic}", "", (change,), (), _DEFAULT_DURATION_S)
 
 
-def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
-    """Return field, value as text, and type of the field."""
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise UsageError(f"{option} {text}: expected FIELD=VALUE")
-    return name, value, field_type(topic.type, name).declared
-
-
-def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
-    name, value, kind = _split("--set", text, topic)
-    if is_array(name, kind):
-        kind = float  # it fills the array
-    if bare(kind) is str:
-        return name, value
-    try:
-        found = msgspec.convert(msgspec.json.decode(value), kind)
-    except (msgspec.DecodeError, msgspec.ValidationError):
+def _amounts(option: str, texts: Sequence[str]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
         try:
-            found = msgspec.convert(value, kind, strict=False)
-        except msgspec.ValidationError as error:
-            raise UsageError(f"--set {text}: {error}") from None
-    return name, msgspec.to_builtins(found)
-
-
-def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
-    name, value, _ = _split(option, text, topic)
-    try:
-        return name, float(value)
-    except ValueError:
-        raise UsageError(f"{option} {text}: expected FIELD=NUMBER") from None
+            found[name] = float(value)
+        except ValueError:
+            raise UsageError(f"{option} {text}: expected FIELD=NUMBER") from None
+    return found
 
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
@@ -245,49 +194,23 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
                        "duration_s": f.duration_s, "topics": [o.topic for o in f.orders]}
                       for f in faults.offered() if f.orders)])
         return
-    for kind, title in faults.kinds.items():
-        rows = [(f.name, " ".join(faults.named[f.name].detected_by if f.name in faults.named
-                                  else ()),
-                 "inf" if f.duration_s is None else f"{f.duration_s:g}", f.title)
-                for f in faults.offered() if f.group == kind]
-        if rows:
-            say(f"{title}:")
-            print_table(("fault", "detected by", "s", "effect"), rows)
-            say()
-    say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}, or a nonsense reading:")
-    print_table(("topic", "modes", "nonsense"), _modes_by_topic(keys, known))
+    print_table(("fault", "detected by", "s", "effect"), [
+        (f.name, " ".join(faults.named[f.name].detected_by if f.name in faults.named else ()),
+         "inf" if f.duration_s is None else f"{f.duration_s:g}", f.title)
+        for f in faults.offered()])
+    say()
+    say("any topic, as MODE:TOPIC:")
+    modes = {resolve(key, known)[0].key: " ".join(modes_of(key, known)) for key in keys}
+    print_table(("topic", "modes"), [row for row in modes.items() if row[1]])
     say()
     others = [name for names in faults.others.values() for name in names]
     if others:
-        say("of the robot, with details after a colon:")
-        for name in others:
-            say(f"  {name}")
-        say()
-    say("any process: kill:NODE, stop:NODE, wedge:NODE; with --fault also hang:NODE and stop:all; "
-        f"slow:NODE or slow:all in virtual time; NODE is one of {', '.join(can_be_hit(spec))}")
-
-
-def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]
-                    ) -> list[tuple[str, str, str]]:
-    """Return topic, modes and nonsense readings in words, with one row for each family."""
-    rows: dict[str, tuple[str, str, str]] = {}
-    for key in keys:
-        modes, topic = modes_of(key, known), resolve(key, known)[0].key
-        missing = [mode for mode in MODES if mode not in modes]
-        if modes:
-            rows[topic] = (topic, f"all but {', '.join(missing)}" if missing else "all",
-                           ", ".join(mode for mode in NONSENSE if mode in modes))
-    return list(rows.values())
+        say(f"of the robot, with details after a colon: {', '.join(others)}")
+    say(f"any process, only from the start of a run by --fault: {', '.join(PROCESS_FAULTS)}, as "
+        f"kill:NODE; NODE is one of {', '.join(can_be_hit(spec))}")
 
 
 # -- the work -----------------------------------------------------------------------------------
-
-
-def _refuse_details(options: argparse.Namespace) -> None:
-    """Refuse the options of a fault of a topic with any other fault."""
-    for name in _OF_TOPICS:
-        if getattr(options, name) not in (None, []):
-            raise UsageError(f"--{name}: only with a fault of a topic, not with {options.fault}")
 
 
 def _refused(watch: FaultWatch) -> str:
@@ -323,67 +246,21 @@ async def _run_fault(name: str, orders: Sequence[Order], options: argparse.Names
             for watch in watches:
                 await _take_hold(session, watch)
                 if not options.json:
-                    order = watch.orders[0].message
                     time = ("until its process ends" if watch.is_permanent
                             else f"for {watch.waits_s:g} s")
-                    what = f"{order.mode} {order.topic} " if _is_of_topic(watch) else ""
-                    say(f"{name}: {what}in force at {', '.join(watch.nodes)} {time}")
-            if not options.at_once:
-                await pause(settled, session.real_s(max(w.waits_s for w in watches)) + 1.0)
-                if not settled.is_set():
-                    await _end(session, [w for w in watches if w.is_permanent])
+                    say(f"{name}: in force at {', '.join(watch.nodes)} {time}")
+            await pause(settled, session.real_s(max(w.waits_s for w in watches)) + 1.0)
+            if not settled.is_set():
+                await _end(session, [w for w in watches if w.is_permanent])
         except asyncio.CancelledError:
             await _end(session, watches)
             raise
     if options.json:
-        _print_result(name, watches, at_once=options.at_once)
-    if not options.at_once:
-        for watch in watches:
-            _judge(watch)
-            if not options.json:
-                where = watch.orders[0].place if _is_of_topic(watch) else ", ".join(watch.nodes)
-                what = f"messages on {where} affected" if _is_of_topic(watch) else "ticks changed"
-                if watch.is_settled:
-                    say(f"{name}: affects {where}, continues" if watch.unfinished else
-                        f"{name}: over, {watch.affected} {what}")
-                else:  # a fault ends with the process that carries it out, and so does its count
-                    say(f"{name}: at least {watch.affected} {what}, until "
-                        f"{', '.join(watch.nodes)} was restarted")
-    return 0
-
-
-async def _hit_process(options: argparse.Namespace) -> int:
-    """Kill, stop or hang a process of the run: `kill:NODE`, `stop:NODE`, `wedge:NODE`.
-
-    Raises:
-        UsageError: there is no run or no such node, or an option does not go with it.
-    """
-    what, _, node = options.fault.partition(":")
-    if what in {"hang", "slow"} or "@" in node or "+" in node:
-        raise UsageError(f"{options.fault}: only from the start of a run, by --fault (slow: in "
-                         "virtual time); here kill:NODE, stop:NODE or wedge:NODE, and --duration")
-    if what != "stop" and options.duration is not None:
-        raise UsageError(f"--duration {options.duration:g}: {what} ends when the node is restarted")
-    _refuse_details(options)
-    positive("--duration", options.duration, "must be seconds above 0, or inf")
-    lasts_s = math.inf if what != "stop" else options.duration or STOPPED_S
-    if options.at_once and math.isfinite(lasts_s):
-        raise UsageError("--at-once: this verb has to continue the stopped process; omit it, or "
-                         "use --duration inf")
-    run = find_run(options.port)
-    victim = await signal_anywhere(node, what.upper(), run.base_port)
-    if not options.json:
-        say(f"{options.fault}: pid {victim.pid}, incarnation {victim.incarnation}"
-            + (f", for {lasts_s:g} s" if math.isfinite(lasts_s) else ""))
-    if math.isfinite(lasts_s):
-        try:
-            await asyncio.sleep(lasts_s / run.rate)
-        finally:
-            with contextlib.suppress(SignalError):  # it has been replaced
-                await signal_anywhere(node, "CONT", run.base_port)
-    if options.json:
-        print_json({"fault": options.fault, "effective": True, "node": node, "pid": victim.pid,
-                    "incarnation": victim.incarnation, "duration_s": lasts_s})
+        _print_result(name, watches)
+    for watch in watches:
+        _judge(watch)
+        if not options.json:
+            say(f"{name}: {_outcome(watch)}")
     return 0
 
 
@@ -420,16 +297,26 @@ def _judge(watch: FaultWatch) -> None:
             f"no effect: {where} was not changed within {watch.waits_s:g} s")
 
 
+def _outcome(watch: FaultWatch) -> str:
+    """Return what a fault has changed, in words."""
+    what = "messages" if _is_of_topic(watch) else "ticks"
+    if not watch.is_settled:  # a fault ends with the process that carries it out, as its count does
+        return (f"at least {watch.affected} {what} changed, until {', '.join(watch.nodes)} was "
+                "restarted")
+    return ("takes effect, and continues" if watch.unfinished else
+            f"over, {watch.affected} {what} changed")
+
+
 def _is_of_topic(watch: FaultWatch) -> bool:
     """Whether a fault disturbs a topic; a node of the robot carries out other faults."""
     return watch.orders[0].topic == bus_topics.INJECT
 
 
-def _print_result(name: str, watches: list[FaultWatch], *, at_once: bool) -> None:
+def _print_result(name: str, watches: list[FaultWatch]) -> None:
     """Print the result as JSON, with null as the duration of a permanent fault."""
     print_json({
         "fault": name,
-        "effective": None if at_once else all(w.affected > 0 for w in watches),
+        "effective": all(w.affected > 0 for w in watches),
         "injections": [
             {"id": order.injection, "topic": w.orders[0].place,
              "mode": order.mode if _is_of_topic(w) else None,

@@ -58,8 +58,7 @@ def add(verbs: Any) -> None:
              whole("--lines", "N", "print the last N lines (default: 50)", 50))
     add_verb(verbs, "top", "watch processes, topics and decisions", top, PORT,
              flag("--once", "print one picture and end"),
-             flag("--json", "print one picture as JSON and end"),
-             flag("--follow", "wait for a run, and for the next one after each run"))
+             flag("--json", "print one picture as JSON and end"))
 
 
 async def node_list(options: argparse.Namespace) -> int:
@@ -187,7 +186,6 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
 
     Examples:
       rampart top
-      rampart top --follow          # stay for the next run
       rampart top --once | less
       NO_COLOR=1 rampart top
       rampart top --json | python3 -m json.tool

@@ -36,17 +36,15 @@ from rampart.actors.recording.bag_writer import complete, open_target
 from rampart.actors.recording.incidents import Incident, incidents_in, state_folder
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.run_documents import recorded_system
-from rampart.cli.output import UsageError, print_json, print_rows, print_table, say, unknown
+from rampart.cli.output import UsageError, print_json, print_rows, print_table, say
 from rampart.cli.record.record_verbs import PLAYING, replay
-from rampart.cli.verbs import JSON, add_family, add_verb, flag, option, word
+from rampart.cli.verbs import JSON, add_family, add_verb, flag, option
 from rampart.files.plain_text import one_line
-
-_SYSTEM = word("--system", "NAME", "only of this system")
 
 
 def names(**_: Any) -> list[str]:
     """Return the names of all incidents."""
-    return [kept.incident.name for kept in _kept(None)]
+    return [kept.incident.name for kept in _kept()]
 
 
 _NAME = option("name", metavar="NAME", nargs="?", completer=names,
@@ -69,7 +67,7 @@ class Kept(NamedTuple):
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     family = add_family(verbs, "incident", "show what was kept around faults", __doc__)
-    add_verb(family, "list", "list the incidents of all runs", incident_list, _SYSTEM, JSON)
+    add_verb(family, "list", "list the incidents of all runs", incident_list, JSON)
     add_verb(family, "show", "show the story of an incident", show, _NAME, JSON)
     add_verb(family, "replay", "play an incident back", replay_incident, _NAME, *PLAYING)
     add_verb(family, "export", "copy an incident to an MCAP file", export, _NAME,
@@ -77,7 +75,7 @@ def add(verbs: Any) -> None:
                     help="new file (default: incident-NAME.mcap)"),
              flag("--overwrite", "replace OUT if it exists"))
     for where, name in ((family, "history"), (verbs, "incidents")):
-        add_verb(where, name, "list the faults of all runs", history, _SYSTEM,
+        add_verb(where, name, "list the faults of all runs", history,
                  flag("--clear", "acknowledge healed faults: they become cleared"), JSON,
                  hidden=where is verbs)
 
@@ -90,9 +88,9 @@ def incident_list(options: argparse.Namespace) -> int:
 
     Examples:
       rampart incident list
-      rampart incident list --system osmosis --json
+      rampart incident list --json
     """
-    found = _kept(options.system)
+    found = _kept()
     if not (found or options.json):
         say(f"no incidents in {state_folder('')}")
         return 0
@@ -148,7 +146,7 @@ async def replay_incident(options: argparse.Namespace) -> int:
 
     Examples:
       rampart incident replay --hmi-port 8090
-      rampart incident replay 20261127-0912 --rate 0.5 --loop
+      rampart incident replay 20261127-0912 --rate 0.5
     """
     with _recording(options.name) as kept:
         options.file = str(kept.path)
@@ -184,10 +182,10 @@ def history(options: argparse.Namespace) -> int:
 
     Examples:
       rampart incident history
-      rampart incident history --system osmosis --clear
+      rampart incident history --clear
     """
     rows: list[tuple[str, Fault]] = []
-    for folder in _folders(options.system):
+    for folder in _folders():
         if options.clear:
             say(f"{folder.name}: {clear_history(folder)} faults cleared")
         rows += ((folder.name, fault) for fault in read_history(folder))
@@ -262,25 +260,20 @@ class Story:
                                      strict=True)) for name, row in self.nodes.items()}}
 
 
-def _folders(system: str | None) -> list[Path]:
-    """Return the folders of the systems, or of one.
+def _folders() -> list[Path]:
+    """Return the folders of the systems.
 
     Raises:
-        UsageError: the system has none, or the user no home directory.
+        UsageError: the user has no home directory.
     """
-    found = {path.name: path for path in sorted(state_folder("").glob("*")) if path.is_dir()}
-    if system is None:
-        return list(found.values())
-    if system not in found:
-        raise unknown("system", system, found)
-    return [found[system]]
+    return sorted(path for path in state_folder("").glob("*") if path.is_dir())
 
 
-def _kept(system: str | None) -> list[Kept]:
+def _kept() -> list[Kept]:
     """Return all incidents, oldest first, also of runs that were cut off."""
     living = {run.run_id for run in find_runs()}
     found = []
-    for folder in _folders(system):
+    for folder in _folders():
         incidents.settle(folder, living)
         found += [Kept(*one) for one in incidents_in(folder)]
     return sorted(found, key=lambda kept: kept.incident.name)
@@ -293,7 +286,7 @@ def _recording(name: str | None) -> Iterator[Kept]:
     Raises:
         UsageError: it is not known, or cannot be read.
     """
-    found = [kept for kept in _kept(None) if kept.incident.name.startswith(name or "")]
+    found = [kept for kept in _kept() if kept.incident.name.startswith(name or "")]
     if not found:
         raise UsageError(f"{name}: no such incident; `rampart incident list` lists them"
                          if name else f"no incidents in {state_folder('')}")

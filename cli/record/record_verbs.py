@@ -24,14 +24,12 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.run_info import RunInfo, find_run
-from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.run_info import find_run
+from rampart.actors.bus.topic import ROOT
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import result_of, stop_pipe
 from rampart.actors.recording.recorder import Recorder
-from rampart.actors.system.topics import declared_topics, system_topics
-from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
 from rampart.cli.output import (
     NoEffectError,
@@ -66,11 +64,8 @@ _TOPICS: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", 
 
 PLAYING = (
     number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
-    flag("--loop", "start again at the end; each pass has higher incarnations"),
     option("--topics", **_TOPICS, help="play only keys that match a pattern"),
     number("--start", "S", "start at simulated second S of the run"),
-    number("--delay", "S", "real seconds before the first message, so that readers can connect",
-           0.0),
     whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
     flag("--viewer", "show the robot in MuJoCo's viewer"),
     word("--video", "FILE.mp4", "write a video of the robot in MuJoCo instead of playing; "
@@ -84,8 +79,6 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "record", "record the run", record, PORT,
              option("file", metavar="FILE", nargs="?",
                     help="MCAP file (default: rampart-TIME.mcap)"),
-             option("--topics", **_TOPICS,
-                    help="record only keys that match a pattern"),
              number("--duration", "S", "end after S real seconds"),
              flag("--overwrite", "replace FILE if it exists"))
     add_verb(verbs, "replay", "play back a recording", replay,
@@ -117,15 +110,13 @@ def record(options: argparse.Namespace) -> int:
     Examples:
       rampart record
       rampart record crash.mcap --duration 60
-      rampart record poses.mcap --topics 'localization/*' 'detection/*'
     """
     positive("--duration", options.duration, below=1e9)
     run = find_run(options.port)
-    wants = _wanted(options.topics, run)
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     check_target(path, overwrite=options.overwrite)
     credentials = tools_credentials(run)[0] if run.hosts else None
-    recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
+    recorder = Recorder(run.base_port, path, overwrite=options.overwrite,
                         credentials=lambda _run: credentials)
     recorder.open()
     stop = stop_pipe()
@@ -153,15 +144,14 @@ async def replay(options: argparse.Namespace) -> int:
       rampart replay run.mcap --hmi-port 8090
       rampart replay run.mcap --viewer
       rampart replay run.mcap --video run.mp4 --rate 4
-      rampart replay run.mcap --rate 4 --start 60 --loop
-      rampart replay run.mcap --topics 'manager/*' --delay 2
+      rampart replay run.mcap --rate 4 --start 60 --topics 'manager/*'
     """
     _check(options)
     stop = asyncio.Event()
     with stopped_by_signals(stop):
         path = Path(options.file)
         known = Summary(BagReader(path)).keys if options.topics else ()
-        chosen: dict[str, Any] = {"start_s": options.start, "loop": options.loop,
+        chosen: dict[str, Any] = {"start_s": options.start,
                                   "wants": matcher(options.topics, known)}
         if options.video:
             return await _film(RecordedRun(path, **chosen), options, stop)
@@ -176,7 +166,7 @@ async def replay(options: argparse.Namespace) -> int:
             page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
             say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
                 "ctrl-C ends it")
-            await player.run(stop, options.delay)
+            await player.run(stop)
     refused = f", {player.refused} of another version left out" if player.refused else ""
     say(f"played {player.played} messages{refused}")
     if not player.played:
@@ -219,32 +209,14 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
 
 
-def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
-    """Return a filter of full keys; actors are loaded only for keys that are not declared."""
-    if not globs:
-        return matcher(globs, ())
-    spec = systems.load(run.system_file)
-    try:
-        return matcher(globs, keys_of(run, declared_topics(spec)))
-    except UsageError:
-        return matcher(globs, keys_of(run, system_topics(spec)))
-
-
-def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
-    """Return all full keys of the known topics in a run."""
-    return [key for topic in known
-            for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
 
 
 def _check(options: argparse.Namespace) -> None:
     between("--rate", options.rate, 0.01, 1000)
-    if not 0 <= options.delay < 1e6:
-        raise UsageError(f"--delay {options.delay:g}: must not be negative")
     if options.start is not None and not -1e9 < options.start < 1e9:
         raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
-    if options.video and (options.loop or options.viewer or options.hmi_port):
-        raise UsageError(f"--video {options.video}: plays nothing; not with --loop, --viewer or "
-                         "--hmi-port")
+    if options.video and (options.viewer or options.hmi_port):
+        raise UsageError(f"--video {options.video}: plays nothing; not with --viewer or --hmi-port")
     between("--port", options.port, *_PORTS)
     between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
     if options.hmi_port == options.port:

@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +32,7 @@ from rampart.actors.bus.zenoh_session import endpoint
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import Panel
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
-from rampart.actors.recording.message_form import Forms, header_of, renumbered
+from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.run_documents import (
     NOT_CHOSEN,
     SYSTEM,
@@ -56,18 +55,14 @@ DEFAULT_PORT = 7400
 PAGE = "replay_page"
 """Name of the operator's page of a replay, different from that of the recorded page."""
 
-GAP_S = 0.1
-"""Simulated seconds between two laps."""
-
 _STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded on no topic's key.")
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
 
 
 class Due(NamedTuple):
-    """A message to be played: lap, simulated time, key and recorded payload."""
+    """A message to be played: simulated time, key and recorded payload."""
 
-    lap: int
     at_s: float
     key: str
     payload: bytes
@@ -88,7 +83,6 @@ class RecordedRun:
 
     Args:
         path: file of the recording.
-        loop: begin again at the end.
         start_s: simulated time at which to begin; None for the beginning.
         wants: whether a full key is played.
 
@@ -102,14 +96,13 @@ class RecordedRun:
         UsageError: it is not a recording of a run, or it has no message to play.
     """
 
-    def __init__(self, path: Path, *, loop: bool = False, start_s: float | None = None,
+    def __init__(self, path: Path, *, start_s: float | None = None,
                  wants: Callable[[str], bool] = lambda _key: True) -> None:
         self.summary = summary = Summary(BagReader(path))
         self.document, self.known = recorded_system(summary.files)
         self.forms = Forms(self.known.topics)
         self.refused = 0
         self._path = path
-        self._loop = loop
         self._wants = wants
         if not summary.reader.is_recording:
             raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}; "
@@ -118,30 +111,22 @@ class RecordedRun:
             raise UsageError(f"{path}: no message to play")
         first_s = summary.first_ns / 1e9 + summary.time_zero_s
         last_s = summary.last_ns / 1e9 + summary.time_zero_s
-        self._lap_s = last_s - first_s + GAP_S
         self._start_s = first_s if start_s is None else max(start_s, first_s)
         if self._start_s > last_s:
             raise UsageError(f"--start {start_s:g}: the recording goes from {first_s:.1f} to "
                              f"{last_s:.1f} simulated seconds")
 
     def messages(self) -> Iterator[Due | None]:
-        """Yield the messages to be played, lap by lap, and None for each other message."""
+        """Yield the messages to be played, and None for each other message."""
         zero_s = self.summary.time_zero_s
-        reader = BagReader(self._path)  # the summary uses its own at the same time
-        for lap in count() if self._loop else range(1):
-            is_empty = True
-            for channel, message in reader.messages():
-                at_s = message.log_time / 1e9 + zero_s + lap * self._lap_s
-                key, payload = key_of(channel), None
-                if key is not None and at_s >= self._start_s and self._wants(key):
-                    try:
-                        payload = self.forms.of(key).payload(message.data)
-                    except (ValueError, RecursionError):  # of another version of this program
-                        self.refused += 1
-                is_empty &= payload is None
-                yield None if key is None or payload is None else Due(lap, at_s, key, payload)
-            if lap and is_empty:  # in the first lap, all may be before the start
-                return
+        for channel, message in BagReader(self._path).messages():
+            at_s, key, payload = message.log_time / 1e9 + zero_s, key_of(channel), None
+            if key is not None and at_s >= self._start_s and self._wants(key):
+                try:
+                    payload = self.forms.of(key).payload(message.data)
+                except (ValueError, RecursionError):  # of another version of this program
+                    self.refused += 1
+            yield None if key is None or payload is None else Due(at_s, key, payload)
 
 
 class Replay(RecordedRun):
@@ -174,7 +159,6 @@ class Replay(RecordedRun):
         self.viewer: Callable[[str, bytes], bool] = lambda _key, _payload: True
         self._report = report
         self._sockets = ""
-        self._lives: dict[str, int] = {}
         claim_port(port)
         if hmi_port:
             try:
@@ -184,7 +168,7 @@ class Replay(RecordedRun):
                                  ) from None
 
     async def run(self, stop: asyncio.Event, delay_s: float = 0.0) -> None:
-        """Play to the end, or until `stop` is set; a page or a loop plays until then.
+        """Play to the end, or until `stop` is set; a page stays until then.
 
         Args:
             stop: ends the replay.
@@ -198,7 +182,8 @@ class Replay(RecordedRun):
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
             async with self._on_the_bus(clock) as (bus, page):
                 while due and await _until(clock.source_time(due.at_s), stop):
-                    self._send(bus, due)
+                    bus.publish(self.forms.of(due.key).topic or _STRANGE, due.key, due.payload)
+                    self.played += 1
                     if not self.viewer(due.key, due.payload):
                         stop.set()
                     due = await anext(messages, None)
@@ -248,19 +233,6 @@ class Replay(RecordedRun):
                 return
             if due is not None:
                 yield due
-
-    def _send(self, bus: ZenohBus, due: Due) -> None:
-        """Send a message; in later laps with later incarnations, or readers drop it as a copy."""
-        payload = due.payload
-        header = header_of(payload) if self._loop else None
-        if header is not None and due.lap == 0:
-            self._lives[header.source] = max(
-                header.incarnation, self._lives.get(header.source, 0))
-        elif header is not None:
-            lives = due.lap * self._lives.get(header.source, header.incarnation)
-            payload = renumbered(payload, lives, due.lap * self._lap_s)
-        bus.publish(self.forms.of(due.key).topic or _STRANGE, due.key, payload)
-        self.played += 1
 
     def _page_ended(self, page: asyncio.Task[None]) -> None:
         if not page.cancelled() and (error := page.exception()) is not None:

@@ -43,7 +43,7 @@ async def test_a_run_is_waited_for_and_the_next_one_follows_until_the_user_has_h
     stop, names = asyncio.Event(), []
 
     async def follow() -> None:
-        async for session in following.sessions(8000, stop, follow=True):
+        async for session in following.sessions(8000, stop):
             names.append(session.run_id)
             runs[:] = [run("other", 9000)]
 
@@ -60,19 +60,10 @@ async def test_a_run_is_waited_for_and_the_next_one_follows_until_the_user_has_h
     assert names == ["first", "second"]
 
 
-async def test_without_following_no_run_is_an_error_and_one_is_enough(runs):
-    with pytest.raises(UsageError, match="no run found"):
-        async for _ in following.sessions(None, asyncio.Event(), follow=False):
-            pass
-    runs.append(run("first"))
-    names = [s.run_id async for s in following.sessions(None, asyncio.Event(), follow=False)]
-    assert names == ["first"]
-
-
 async def test_several_runs_are_a_choice_for_the_user_by_the_verbs_own_option(runs):
     runs += [run("one", 8000), run("other", 9000)]
     with pytest.raises(UsageError, match="choose with --run"):
-        async for _ in following.sessions(None, asyncio.Event(), follow=True, option="--run"):
+        async for _ in following.sessions(None, asyncio.Event()):
             pass
 
 

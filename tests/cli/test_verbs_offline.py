@@ -15,7 +15,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve
-from rampart.cli.look.topic_verbs import in_line, rate_of
+from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verb import choose
 from rampart.cli.output import UsageError
@@ -87,38 +87,26 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "melt:plan/route"], ["'melt:plan/route'", "drop, freeze"]),
     (["inject", "corrupt:summit_xl/brake"], ["no number", "BrakeCommand"]),
     (["inject", "drop:world/truth"], ["judge"]),
-    (["inject", "wrong-graph", "--set", "x_m=1"], ["--set: only with corrupt:TOPIC"]),
     (["inject", "wrong-graph", "--system", "osmosis"], ["--system osmosis: only with --list"]),
-    (["inject", "obstacle-ahead"], ["--fault obstacle-ahead@"]),
-    (["inject", "weak-wheel:nose"], ["unknown wheel 'nose'; known: front-left"]),
-    (["inject", "stuck-wheel", "--share", "0.5"], ["--share: only with a fault of a topic"]),
+    (["inject", "wrong-graph", "--ramp", "x_m=1"], ["--ramp", "only with corrupt:TOPIC"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
     (["inject", "wrong-graph", "--on", "1"], ["--off"]),
     (["inject", "wrong-graph", "--on", "1", "--off", "inf"], ["--off inf"]),
+    (["inject", "corrupt:localization/pose", "--add", "z_m=1"], ["'z_m'", "x_m, y_m, yaw_rad"]),
+    (["inject", "corrupt:plan/route", "--ramp", "step=up"], ["--ramp step=up: expected FIELD"]),
+    (["inject", "corrupt:localization/pose", "--noise", "x_m=-1"], ["'x_m' = -1", "0 or more"]),
+    (["inject", "obstacle-ahead"], ["--fault obstacle-ahead@"]),
+    (["inject", "weak-wheel:nose"], ["unknown wheel 'nose'; known: front-left"]),
+    (["inject", "stuck-wheel", "--seed", "5"], ["--seed: only with a fault of a topic"]),
     (["inject"], ["--list"]),
     (["inject", "wrong-graph", "--duration", "-1"], ["--duration -1"]),
     (["inject", "drop:detection/*"], ["no topic"]),
-    (["inject", "delay:localization/pose", "--delay", "0"], ["--delay 0"]),
-    (["inject", "drop:localization/pose", "--stamp", "1"], ["--stamp"]),
-    (["inject", "corrupt:localization/pose", "--set", "z_m=1"],
-     ["'z_m'", "x_m, y_m, yaw_rad"]),
-    (["inject", "corrupt:localization/pose", "--set", "x_m=east"],
-     ["x_m=east", "float"]),
-    (["inject", "corrupt:plan/route", "--ramp", "step=1"], ["float"]),
-    (["inject", "corrupt:localization/pose", "--noise", "x_m=-1"], ["'x_m' = -1", "0 or more"]),
-    (["inject", "slow:pump"], ["slow:pump: only from the start of a run, by --fault"]),
-    (["inject", "kill:pump@3"], ["kill:pump@3: only from the start of a run"]),
-    (["inject", "kill:pump", "--duration", "3"], ["--duration 3: kill ends when the node is"]),
-    (["inject", "kill:pump", "--share", "0.5"], ["--share: only with a fault of a topic, not"]),
-    (["inject", "stop:pump", "--at-once"], ["--at-once: this verb has to continue the stopped"]),
-    (["inject", "stop:pump", "--duration", "-1"], ["--duration -1: must be seconds above 0"]),
+    (["inject", "kill:pump"], ["kill:pump: only from the start of a run, by --fault", "kill-node"]),
     (["topic", "info", "plan/rout"], ["'plan/rout'", "the nearest of", "plan/route"]),
     (["topic", "echo", "localization/pose/x"], ["no run found"]),
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
     (["tree", "--active", "FTM9"], ["'FTM9'", "known: FTM1"]),
     (["tree", "--order", "bravest"], ["'bravest'", "known: safer"]),
-    (["tree", "--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .json, .txt"]),
-    (["tree", "--output", "/no/such/tree.svg"], ["/no/such/tree.svg: No such file"]),
     (["cut-sets", "nowhere.xml"], ["nowhere.xml: No such file or directory"]),
     (["cut-sets", "--active", "FTM99"], ["unknown mechanism 'FTM99'; known: FTM1"]),
     (["cut-sets", "--limit", "-1"], ["--limit -1: must be 0 or more"]),
@@ -137,7 +125,7 @@ def test_nonsense_is_refused_in_one_line_that_names_it(refused, monkeypatch, arg
 
 
 @pytest.mark.parametrize("arguments", [
-    ["status"], ["node", "list"], ["topic", "hz", "plan/route"], ["inject", "wrong-graph"],
+    ["status"], ["node", "list"], ["inject", "wrong-graph"],
     ["topic", "echo", "plan/route"], ["reset", "RM1"], ["obstacle", "remove", "crate"]])
 def test_without_a_run_each_verb_says_so_and_exits_2(refused, arguments):
     assert refused(*arguments) == "rampart: no run found; start one with `python launch.py`\n"
@@ -149,20 +137,15 @@ def test_the_catalogue_is_listed_with_who_should_see_each_fault(capsys):
     assert (listed["wrong-graph"], listed["command-not-updated"]) == (["DM1"], ["DM2"])
 
 
-NOISE = SENSOR_FAULTS["gps-noise"].disturbances[0]
-
-
 @pytest.mark.parametrize(("arguments", "order"), [
     (["gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"], {
-        "share": 0.3, "on_s": 1.0, "off_s": 4.0, "seed": 7, "noise_fields": NOISE.noise_fields}),
-    (["corrupt:summit_xl/scan", "--add", "ranges_f32=0.4", "--noise", "ranges_f32=0.2", "--set",
-      "range_max_m=9", "--seed", "3"], {
-          "topic": "summit_xl/scan", "mode": "corrupt", "duration_s": 4.0, "seed": 3,
-          "set_fields": {"range_max_m": 9.0}, "add_fields": {"ranges_f32": 0.4},
-          "noise_fields": {"ranges_f32": 0.2}}),
-    (["corrupt:summit_xl/odom", "--ramp", "pose.x_m=0.5"], {"ramp_fields": {"pose.x_m": 0.5}}),
-    (["corrupt:rampart/plan/route", "--set", "reason=why not", "--set",
-      "step=3"], {"topic": "plan/route", "set_fields": {"reason": "why not", "step": 3}}),
+        "share": 0.3, "on_s": 1.0, "off_s": 4.0, "seed": 7,
+        "noise_fields": SENSOR_FAULTS["gps-noise"].disturbances[0].noise_fields}),
+    (["corrupt:summit_xl/scan", "--add", "ranges_f32=0.4", "--noise", "ranges_f32=0.2", "--seed",
+      "3"], {"topic": "summit_xl/scan", "mode": "corrupt", "duration_s": 4.0, "seed": 3,
+             "add_fields": {"ranges_f32": 0.4}, "noise_fields": {"ranges_f32": 0.2}}),
+    (["corrupt:rampart/summit_xl/odom", "--ramp", "pose.x_m=0.5"], {
+        "topic": "summit_xl/odom", "ramp_fields": {"pose.x_m": 0.5}}),
 ])
 def test_a_fault_is_put_together_from_options(arguments, order):
     (made,) = choose(build_parser().parse_args(["inject", *arguments])).orders("i1", 4.0)
@@ -179,14 +162,6 @@ def test_a_key_is_found_however_it_is_written(key, topic, full):
     assert resolve(key, topics.ALL) == (topic, full)
     with pytest.raises(UsageError, match="unknown topic"):
         resolve(f"{key}/x", topics.ALL)
-
-
-def test_rates_are_measured_like_ros2_does():
-    rate = rate_of([0.0, 0.1, 0.2, 0.4])
-    assert rate["rate_hz"] == pytest.approx(7.5)
-    assert (rate["min_s"], rate["max_s"]) == (pytest.approx(0.1), pytest.approx(0.2))
-    assert rate["window"] == 4
-    assert rate_of([1.0])["rate_hz"] is None
 
 
 def test_long_bytes_are_counted_not_printed():
@@ -206,9 +181,8 @@ def test_topics_of_a_robot_s_own_actors_are_listed_and_described(capsys, tmp_pat
     assert (info["publishers"], info["readers"]) == (["platform"], ["display"])
     assert main(["inject", "--list", *own]) == 0
     rows = [line.split(maxsplit=1) for line in told(capsys).splitlines() if len(line.split()) > 1]
-    assert dict(rows)["porter/load"].split(maxsplit=1) == [
-        "all", "zero, negative, huge, infinite, nan"]
-    assert dict(rows)["porter/axle/{name}"] == "all but corrupt"
+    assert {"drop", "corrupt", "zero", "nan"} < set(dict(rows)["porter/load"].split())
+    assert "corrupt" not in dict(rows)["porter/axle/{name}"].split()
 
 
 def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topics_only(
@@ -218,7 +192,6 @@ def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topic
     run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
     monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: run)
     for arguments in (["topic", "list", "--system", file], ["inject", "drop:porter/load"],
-                      ["campaign", "--list", "--system", file],
                       ["campaign", "--fault", "drop:porter/load", "--system", file]):
         assert "No module named 'no_actors'" in refused(*arguments)
     assert "no run found" in refused("topic", "echo", "plan/route")

@@ -13,7 +13,6 @@ import pytest
 
 from rampart.cli import run_options, systems
 from rampart.cli.analyse import campaign_verb
-from rampart.cli.main import main
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.faults import PROCESS_FAULTS
 from rampart.sim.faults.topic_faults import NONSENSE
@@ -31,11 +30,6 @@ def test_a_command_is_accepted(line):
     parse = {"run": lambda: run_options.parse(arguments, "rampart run"),
              "campaign": lambda: campaign_verb.parse(arguments)}[verb]
     assert parse()
-
-
-def test_the_list_of_faults_is_printed(capsys):
-    assert main(["campaign", "--list"]) == 0
-    assert "kill:osmosis_control" in capsys.readouterr().out
 
 
 def test_the_table_has_every_kind_of_fault_and_every_mode():

@@ -20,7 +20,7 @@ from rampart.actors.osmosis.airport.graph_format import allowed_area
 from rampart.actors.osmosis.airport.model import AirportError
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
-from rampart.actors.recording.message_form import Forms, header_of, renumbered
+from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.run_documents import recorded_system, restore
 from rampart.cli.record.record_verbs import described
 from rampart.files import toml
@@ -291,7 +291,6 @@ def recorded_json(data: bytes) -> None:
             refused = error
         else:
             header_of(payload)
-            renumbered(payload, 2, 1.5)
     if refused is not None:
         raise refused
 

@@ -181,7 +181,7 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(9)
-        injected = run.tool("inject", "command-out-of-bounds", "--duration", "60", "--at-once")
+        injected = run.tool("inject", "command-out-of-bounds", "--duration", "inf")
         assert injected.returncode == 0, injected.stderr
         in_the_way(tmp_path / "report")
         run.wait_until(lambda: "UNSAFE" in run.story or run.process.poll() is not None, 100,

@@ -51,7 +51,7 @@ def test_the_model_stands_where_the_messages_put_it_and_ignores_what_is_no_pose(
     (["--video", "run.avi"], "--video run.avi: expected a name that ends in .mp4"),
     (["--video", "there.mp4"], "--video there.mp4: exists already"),
     (["--video", "no/such/place.mp4"], "there is no such directory"),
-    (["--video", "new.mp4", "--loop"], "--video new.mp4: plays nothing")])
+    (["--video", "new.mp4", "--viewer"], "--video new.mp4: plays nothing")])
 def test_a_video_that_cannot_be_is_refused_in_one_line(
         recording, monkeypatch, refused, words, told):
     monkeypatch.chdir(recording.parent)
@@ -87,7 +87,7 @@ def test_the_viewer_shows_what_is_played_and_a_closed_window_ends_the_replay(
             opt=mujoco.MjvOption(), sync=lambda: shown.append(float(data.qpos[0])),
             is_running=lambda: len(shown) < 5)
 
-    replay = ["replay", str(recording), "--viewer", "--loop", "--port", str(free_base_port())]
+    replay = ["replay", str(recording), "--viewer", "--port", str(free_base_port())]
     monkeypatch.setattr(glfw, "init", lambda: False)
     assert main(replay) == 1
     assert "--viewer: no window can be opened" in capsys.readouterr().err

@@ -25,7 +25,6 @@ from rampart.actors.recording.message_form import (
     MessageForm,
     Recorded,
     header_of,
-    renumbered,
 )
 
 form_of = Forms(topics.ALL).of
@@ -107,7 +106,6 @@ def test_garbage_in_the_form_of_an_envelope_with_a_text_that_is_none_is_garbage_
         assert form.payload(text) == payload
     nameless = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\xc0"
     assert header_of(nameless) is None
-    assert renumbered(nameless, 1, 1.0) == nameless
 
 
 def test_a_message_is_legible_and_only_one_that_json_cannot_hold_has_its_payload_beside_it():
@@ -147,14 +145,6 @@ def test_the_text_raw_in_a_message_is_no_payload():
 def test_what_is_no_recorded_message_is_refused(text):
     with pytest.raises(ValueError):  # noqa: PT011 msgspec's words
         form_of(topics.POSE.at()).payload(text)
-
-
-def test_a_later_lap_is_a_later_life_and_nothing_else_of_the_message_changes():
-    payload = encode(Header("DM1", 2, 7, 3.0), m.Pose(1.0, 2.0, float("inf")))
-    assert renumbered(payload, 3, 10.0) == encode(
-        Header("DM1", 5, 7, 13.0), m.Pose(1.0, 2.0, float("inf")))
-    assert renumbered(b"\xc1", 3, 10.0) == b"\xc1"
-    assert header_of(b"\xc1") is None
 
 
 @pytest.mark.parametrize("topic", topics.ALL, ids=lambda t: t.key)

@@ -51,7 +51,7 @@ def test_the_list_has_finished_incidents_and_those_that_are_not_over(box, capsys
     text = printed(capsys, "list")
     assert "localization crashed, incarnation 1" in text
     assert "not over yet" in text
-    found = json.loads(printed(capsys, "list", "--system", "paper", "--json"))["incidents"]
+    found = json.loads(printed(capsys, "list", "--json"))["incidents"]
     assert [(row["at_s"], row["partial"]) for row in found] == [
         (30.5, ""), (100.5, "not over yet")]
     assert names() == [row["name"] for row in found]
@@ -89,8 +89,7 @@ def test_an_incident_is_played_back(box, capsys):
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["show", "nothing"], "nothing: no such incident"),
-    (["show", "2027"], "2027: 2 incidents begin so"),
-    (["list", "--system", "nothing"], "unknown system 'nothing'; known: ")])
+    (["show", "2027"], "2027: 2 incidents begin so")])
 @pytest.mark.usefixtures("box")
 def test_an_unknown_name_is_refused_in_one_line(refused, arguments, words):
     assert words in refused("incident", *arguments)
@@ -164,9 +163,8 @@ def test_a_user_without_a_home_directory_has_a_run_and_one_line(monkeypatch, cap
     monkeypatch.setattr("os.getuid", lambda: 4_000_000)  # as in a container
     options, _ = parse(["--system", str(CELL)], "launch.py")
     assert black_box_folder(options, shipped_system()) == ""
-    assert capsys.readouterr().err == (
-        "launch.py: black box: this user has no home directory; expected a folder in "
-        "XDG_STATE_HOME\n")
+    assert capsys.readouterr().err.endswith(
+        ": black box: this user has no home directory; expected a folder in XDG_STATE_HOME\n")
     assert main(["incident", "list"]) == 2
 
 

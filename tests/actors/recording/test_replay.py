@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
 import os
 import signal
 import socket
@@ -20,7 +19,7 @@ from websockets.asyncio.client import connect as open_socket
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import run_info
-from rampart.actors.bus.envelope import ArrivalGuard, Header, encode
+from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm import messages as fm
@@ -107,27 +106,6 @@ async def test_readers_hear_every_payload_as_it_was_sent_garbage_and_nan_include
     assert (player.played, player.refused) == (len(sent), 0)
 
 
-async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
-    sent = [*(pose(n + 1, n * 0.02) for n in range(5)),
-            *(pose(n + 1, 0.1 + n * 0.02, incarnation=2) for n in range(5))]
-    write(tmp_path / "run.mcap", sent)
-    guard, taken, refused = ArrivalGuard(lambda: math.inf), [], []
-    receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message),
-                             lambda key, reason: refused.append(reason))
-    player = Replay(tmp_path / "run.mcap", port=port, loop=True, rate=2.0)
-    async with playing(player), reading(port, topics.POSE.at()) as heard:
-        await eventually(lambda: len(heard) >= 30, 15)
-    for key, payload in heard[:30]:
-        receive(key, payload)
-    assert refused == []
-    assert [message.incarnation for message in taken] == [
-        *[1] * 5, *[2] * 5, *[3] * 5, *[4] * 5, *[5] * 5, *[6] * 5]
-    assert [message.sequence for message in taken] == [1, 2, 3, 4, 5] * 6
-    stamps = [message.stamp for message in taken]
-    assert stamps == sorted(stamps)
-    assert heard[0][1] == sent[0][2]  # the first lap is as it was recorded
-
-
 async def test_only_what_is_wanted_is_played_from_where_it_is_wanted(tmp_path, port):
     sent = sample()
     write(tmp_path / "run.mcap", sent)
@@ -161,11 +139,10 @@ async def test_what_lies_before_the_start_is_not_decoded_and_not_caught_up_with(
     assert sent[-1] - sent[0] > 0.9, "one each 0.2 s, never sooner"
 
 
-async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
-        recording, port, monkeypatch):
+async def test_a_recording_of_which_nothing_can_be_read_ends(recording, port, monkeypatch):
     monkeypatch.setattr(Forms, "of", lambda *_: MessageForm(None))
     monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
-    player = Replay(recording, port=port, loop=True)
+    player = Replay(recording, port=port)
     await player.run(asyncio.Event())
     assert player.played == 0
 
@@ -188,7 +165,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(recording, t
     verb = subprocess.Popen(
         [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay",
          str(recording),
-         "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
+         "--rate", "0.01", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()
     wait_until(lambda: any(folder.iterdir()), 30)
@@ -201,7 +178,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(recording, t
 async def test_tools_find_a_replay_that_is_no_robot_and_takes_no_orders(
         recording, port, monkeypatch):
     other, found, second = free_base_port(), run_info.find_runs, Replay(recording, port=port)
-    async with playing(Replay(recording, port=port, loop=True)), reading(port):
+    async with playing(Replay(recording, port=port, rate=0.05)), reading(port):
         async with connect(port) as session:
             assert session.run.replay_of.endswith("run.mcap")
             assert session.run.title == "replay of run.mcap: a sample"
@@ -239,7 +216,6 @@ def test_a_port_in_use_is_refused(recording, port, capsys, monkeypatch):
     (["--topics", "nothing"], "--topics nothing: matches no topic; known: detection/…"),
     (["--rate", "0"], "--rate 0: must be between"), (["--rate", "nan"], "--rate nan"),
     (["--start", "1000"], "--start 1000: the recording goes from 0.0 to 0.9"),
-    (["--delay", "-1"], "--delay -1: must not be negative"),
     (["--hmi-port", "80"], "--hmi-port 80: must be between 1024"),
     (["--port", "7411", "--hmi-port", "7411"], "--hmi-port 7411: is the replay's own --port")])
 def test_a_replay_that_makes_no_sense_is_refused_in_one_line(
@@ -299,7 +275,7 @@ async def test_the_page_of_a_robot_without_application_is_a_replay_s_and_all_of_
             writer.take(number / 20, "rampart/world/truth", encode(header, body))
         writer.close()
     page_port = port + 30
-    player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
+    player = Replay(tmp_path / "run.mcap", port=port, hmi_port=page_port)
     told = {}
     async with playing(player), reading(port, ftm_topics.RESET.at()):
         async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page:
@@ -319,7 +295,7 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
         *((n * 0.1, ftm_topics.MANAGER_STATUS.at(),
            encode(Header("ftm_manager", 1, n + 1, n * 0.1), manager)) for n in range(10))]))
     page_port, seen = port + 30, ""
-    player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
+    player = Replay(tmp_path / "run.mcap", port=port, hmi_port=page_port)
     async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
         url = f"http://127.0.0.1:{page_port}/"
         document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())

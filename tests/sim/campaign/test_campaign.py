@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from rampart.cli import systems
-from rampart.cli.analyse import campaigning
+from rampart.cli.analyse import campaign_verb
 from rampart.cli.main import main as rampart
 from rampart.sim.campaign.content import with_content
 from rampart.sim.campaign.execute import JobError, execute
@@ -213,7 +213,7 @@ def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
     def broken(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(campaigning, "write_campaign_report", broken)
+    monkeypatch.setattr(campaign_verb, "write_campaign_report", broken)
     lost = with_content(paper.full_jobs())[0]
     made_up[lost.key] = result(safe=False)
     assert rampart(["campaign", "--paper", "--full", "--json", "--out", str(tmp_path)]) == 1
@@ -319,7 +319,6 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
     (("--paper", "--runs", "3"), "expected one of"),
     (("--full",), "--full: only with --paper"),
     (("--runs", "0"), "--runs 0: must be 1 or more"),
-    (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
     (("--fault", "gremlins"), "unknown fault 'gremlins'"),
     (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be a number"),
     (("--runs", "3", "--obstacles", "99"), "obstacles = 99: expected at most 5 on Vallombre"),
@@ -351,17 +350,10 @@ def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
     assert "none or several match" in capsys.readouterr().err
 
 
-def test_patterns_choose_faults_by_name(capsys):
-    for chosen, groups in ((["--system", "paper"], GROUPS),
-                           ([], fault_groups(systems.load("osmosis")))):
-        assert rampart(["campaign", "--list", "--json", *chosen]) == 0
-        assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in groups.items()}
-
-
 def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
-    own = ["campaign", "--system", str(write_porter_system(tmp_path))]
-    assert rampart([*own, "--list", "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)["topic"]
+    system = str(write_porter_system(tmp_path))
+    own = ["campaign", "--system", system]
+    listed = fault_groups(systems.load(system))["topic"]
     assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
     (tmp_path / "NEAR.miss").write_text("x=-28.5,y=4,taxi=1\n")
     assert rampart([*own, "--fault", "drop:porter/load@2+1", "--obstacles", "0", "--jobs", "1",
@@ -381,8 +373,8 @@ def made_up(monkeypatch):
             store.add(job, bad.get(job.key, result()))
         return len(jobs)
 
-    monkeypatch.setattr(campaigning, "execute", fake)
-    monkeypatch.setattr(campaigning, "worth_showing", lambda _runs: [])
+    monkeypatch.setattr(campaign_verb, "execute", fake)
+    monkeypatch.setattr(campaign_verb, "worth_showing", lambda _runs: [])
     return bad
 
 
