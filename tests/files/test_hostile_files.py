@@ -148,7 +148,7 @@ def foreign(folder: Path, image: bytes | None = None, graph: str = json.dumps(GR
 FOREIGN = {
     "50,000 x 50,000 pixels": ({"image": png_of(50_000, 50_000)}, "at most 16777216"),
     "no rows": ({"image": png_of(100, 0)}, "unreadable"),
-    "noise": ({"image": png_noise(1000)}, "more than 20000 rectangles"),
+    "noise": ({"image": png_noise(1000)}, "more than 100000 runs"),
     "another kind of image by the name of a PNG": ({"image": b"GIF89a" + b"\0" * 100},
                                                    "unreadable"),
     "a graph nested without end": ({"graph": '{"nodes":' + "[" * 100_000}, "expected a graph"),

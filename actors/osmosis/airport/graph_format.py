@@ -46,8 +46,8 @@ MAX_IMAGE_BYTES = 32 << 20
 MAX_PIXELS = 1 << 24
 """4,096 x 4,096, at the authors' scale 790 m x 890 m. The authors' image has 0.6 million."""
 
-MAX_BOXES = 20_000
-"""Rectangles that make up the pavement; a slanted edge needs one per row of pixels."""
+MAX_RUNS = 100_000
+"""Runs of pixels that make up the pavement, each in one row."""
 
 
 COLUMNS_PER_M, ROWS_PER_M, LEFT_M, TOP_M = 5.2, 4.6, -80.0, 80.0
@@ -68,11 +68,11 @@ def allowed_area(path: Path) -> Any:
     allowed = _without_lone_pixels(~prohibited)
     if not allowed.any():
         raise AirportError(f"{path}: area image: entirely red: expected pavement that is not red")
-    boxes = _boxes(allowed)
-    if boxes is None:
-        raise AirportError(f"{path}: area image: pavement of more than {MAX_BOXES} rectangles: "
+    runs = _runs(allowed)
+    if len(runs) > MAX_RUNS:
+        raise AirportError(f"{path}: area image: pavement of more than {MAX_RUNS} runs of pixels: "
                            "expected straight edges without noise")
-    area = shapely.unary_union(_rectangles(boxes))
+    area = shapely.unary_union(runs)
     pixel_m = max(1 / COLUMNS_PER_M, 1 / ROWS_PER_M)
     speck_m2 = SPECK_PIXELS / (COLUMNS_PER_M * ROWS_PER_M)
     return _without_specks(shapely.simplify(area, pixel_m).buffer(0), speck_m2)
@@ -107,34 +107,14 @@ def _without_lone_pixels(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_
     return np.asarray(votes) >= 5
 
 
-def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
-    """Return boxes of allowed pixels: one per run of pixels, over all rows with the same run.
-
-    Returns:
-        First column, first row, last column and last row as one array each; None if too many.
-    """
-    # An empty last row closes the open runs.
-    steps = np.diff(np.pad(allowed, ((0, 1), (1, 1))).astype(np.int8), axis=1)
-    boxes: list[tuple[float, float, float, float]] = []
-    open_runs: dict[tuple[int, int], int] = {}
-    for row, step in enumerate(steps):
-        begins, ends = np.flatnonzero(step == 1), np.flatnonzero(step == -1)
-        runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
-        for run in [run for run in open_runs if run not in runs]:
-            boxes.append((run[0], open_runs.pop(run), run[1], row))
-        for run in runs:
-            open_runs.setdefault(run, row)
-        if len(boxes) > MAX_BOXES:
-            return None
-    return np.array(boxes, dtype=float).T
-
-
-def _rectangles(boxes: npt.NDArray[np.float64]) -> list[Any]:
-    """Convert boxes of pixels to rectangles in `map`."""
-    c0, r0, c1, r1 = boxes
-    x0, x1 = (LEFT_M + c / COLUMNS_PER_M for c in (c0, c1))
-    y0, y1 = (TOP_M - r / ROWS_PER_M for r in (r1, r0))
-    return list(shapely.box(x0, y0, x1, y1))
+def _runs(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.object_]:
+    """Return a rectangle in `map` for each run of allowed pixels in a row."""
+    steps = np.diff(np.pad(allowed, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    rows, begins = np.nonzero(steps == 1)
+    _, ends = np.nonzero(steps == -1)
+    x0, x1 = (LEFT_M + columns / COLUMNS_PER_M for columns in (begins, ends))
+    y0, y1 = (TOP_M - row / ROWS_PER_M for row in (rows + 1, rows))
+    return np.asarray(shapely.box(x0, y0, x1, y1))
 
 
 def _without_specks(area: Any, speck_m2: float) -> Any:
