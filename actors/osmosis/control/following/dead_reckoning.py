@@ -33,8 +33,6 @@ class DeadReckoning:
     """
 
     def __init__(self, bridge_m: float, after_s: float = AFTER_S) -> None:
-        if not 0 < bridge_m < math.inf:
-            raise ValueError(f"bridge_m = {bridge_m!r}: must be positive and finite")
         self.bridge_m = bridge_m
         self.after_s = after_s
         self._pose: Pose2 | None = None

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Protocol
 
+import msgspec
 from shapely.geometry import box
 
 from rampart.actors.bus.topic import Topic
@@ -158,30 +159,35 @@ Items = Iterable[tuple[float, Reading | Truth]]
 def mis_stamped(items: Items, topic: Topic[Any], wrong: str, from_s: float, *, once: bool
                 ) -> Iterator[tuple[float, Reading | Truth]]:
     """Yield what arrives; one reading of a topic, or all from then on, with a wrong stamp."""
-    done = False
-    for now_s, item in items:
-        if isinstance(item, Reading) and item.topic is topic and now_s >= from_s and not done:
-            done = once
-            yield now_s, replace(item, stamp_s=WRONG_STAMPS[wrong](now_s))
-        else:
-            yield now_s, item
+    return _altered(items, topic, from_s, lambda reading: [
+        replace(reading, stamp_s=WRONG_STAMPS[wrong](reading.stamp_s))], once=once)
 
 
 def with_absurd(items: Items, topic: Topic[Any], from_s: float
                 ) -> Iterator[tuple[float, Reading | Truth]]:
     """Yield what arrives, and before one reading two whose numbers are too large for a square."""
+    return _altered(items, topic, from_s, lambda reading: [
+        Reading(topic, reading.stamp_s - 0.002, _filled(reading.body, 1e300)),
+        Reading(topic, reading.stamp_s - 0.001, _filled(reading.body, -1e300)), reading],
+        once=True)
+
+
+def _filled(body: Any, number: float) -> Any:
+    """Return a message with one number in all its fields."""
+    return type(body)(*(_filled(value, number) if isinstance(value, msgspec.Struct) else number
+                        for value in msgspec.structs.astuple(body)))
+
+
+def _altered(items: Items, topic: Topic[Any], from_s: float,
+             alter: Callable[[Reading], list[Reading]], *, once: bool
+             ) -> Iterator[tuple[float, Reading | Truth]]:
     done = False
     for now_s, item in items:
-        if now_s >= from_s and isinstance(item, Reading) and item.topic is topic and not done:
-            done = True
-            for number, behind_s in ((1e300, 0.002), (-1e300, 0.001)):
-                yield now_s, Reading(topic, now_s - behind_s, {
-                    topics.GPS: m.GpsFix(number, number, number, number, abs(number)),
-                    topics.IMU: m.Imu(number, number, number, number),
-                    topics.ODOMETRY: m.Odometry(
-                        m.Pose(number, number, number), m.Twist(number, number)),
-                    topics.ABSOLUTE_POSE: m.Pose(number, number, number)}[topic])
-        yield now_s, item
+        if isinstance(item, Reading) and item.topic is topic and now_s >= from_s and not done:
+            done = once
+            yield from ((now_s, reading) for reading in alter(item))
+        else:
+            yield now_s, item
 
 
 # ---- who reads it --------------------------------------------------------------------------------

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
+from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
 from tests.actors.osmosis.control.world import World
 from tests.osmosis_system import System, shipped_system
 
@@ -57,8 +56,8 @@ def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
 
 
 @pytest.mark.parametrize(("stamp_s", "pose"), [
-    (None, (math.nan, 0.0, 0.0)), (None, (0.0, math.inf, 0.0)), (None, (1e160, 1e160, -1e160)),
-    *((stamp_s, (50.0, 60.0, 0.0)) for stamp_s in (1e9, 1.3, math.inf, math.nan))])
+    (None, (math.nan, 0.0, 0.0)), (None, (1e160, 1e160, -1e160)),
+    *((stamp_s, (50.0, 60.0, 0.0)) for stamp_s in (1e9, 1.3, math.nan))])
 def test_an_impossible_reading_changes_nothing_and_shuts_out_none(stamp_s, pose):
     it = DeadReckoning(3.0)
     it.odometry(0.0 if stamp_s is None else stamp_s, pose, 0.0)
@@ -70,12 +69,6 @@ def test_an_impossible_reading_changes_nothing_and_shuts_out_none(stamp_s, pose)
     assert it.estimate(1.1) == pytest.approx((1.2, 2.0, 0.0))
     it.pose(1.1, (1.3, 2.0, 0.0), 1.1)
     assert it.estimate(1.1) == (1.3, 2.0, 0.0)
-
-
-@pytest.mark.parametrize("bridge_m", [0.0, math.nan, math.inf])
-def test_a_bound_that_is_none_is_refused(bridge_m):
-    with pytest.raises(ValueError, match="bridge_m"):
-        DeadReckoning(bridge_m)
 
 
 moves = st.lists(st.tuples(st.floats(-0.02, 0.02), st.floats(-0.05, 0.05)), min_size=1,
@@ -97,25 +90,6 @@ def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves,
     assert found is not None
     assert found[:2] == pytest.approx(truth[:2], abs=1e-9)
     assert math.remainder(found[2] - truth[2], math.tau) == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("from_s", [2.0, 12.0])
-def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(from_s):
-    it, worst_m, bridged = DeadReckoning(3.0), 0.0, 0
-    for now_s, item in disturbed([]):
-        if isinstance(item, Reading) and item.topic is topics.ODOMETRY:
-            pose = item.body.pose
-            it.odometry(now_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
-        elif isinstance(item, Reading) and item.topic is topics.ABSOLUTE_POSE and now_s <= from_s:
-            it.pose(now_s, (item.body.x_m, item.body.y_m, item.body.yaw_rad), now_s)
-        elif isinstance(item, Truth) and now_s > from_s + AFTER_S:
-            found = it.estimate(now_s)
-            if found is None:
-                break
-            bridged += 1
-            worst_m = max(worst_m, math.dist(found[:2], (item.x_m, item.y_m)))
-    assert bridged > 20
-    assert worst_m < 0.25
 
 
 # ---- in Osmosis Control --------------------------------------------------------------------------

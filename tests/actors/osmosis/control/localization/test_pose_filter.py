@@ -133,16 +133,14 @@ def test_any_single_fault_of_a_source_is_borne_by_all_who_read_it(name, how):
         assert (located.filter.owed_m, located.lost_s) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("wrong", [
+    "far ahead", "no number",
+    *(pytest.param(wrong, marks=pytest.mark.nightly) for wrong in ("ahead", "infinite"))])
 @pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
-@pytest.mark.parametrize("once", [
-    False, pytest.param(True, marks=pytest.mark.nightly)], ids=["permanent", "once"])
-def test_stamps_of_no_possible_time_are_borne_like_any_other_fault(topic, wrong, once):
+def test_stamps_of_no_possible_time_are_borne_like_any_other_fault(topic, wrong):
     located, voted, accused = Located(), Voted(), Accused()
-    watch(mis_stamped(disturbed([]), topic, wrong, FROM_S, once=once), located, voted, accused)
+    watch(mis_stamped(disturbed([]), topic, wrong, FROM_S, once=False), located, voted, accused)
     assert_borne(located, voted, accused)
-    if once:
-        assert located.excluded == set()
 
 
 @pytest.mark.parametrize("wrong", WRONG_STAMPS)
@@ -193,13 +191,10 @@ def test_without_both_positions_it_dead_reckons_with_growing_uncertainty_and_the
 
 
 @pytest.mark.parametrize("names", [
-    ("gps-dropout", "absolute-pose-drift"), ("gps-dropout", "absolute-pose-bias"),
-    ("absolute-pose-dropout", "gps-bias"), ("absolute-pose-dropout", "gps-drift"),
+    ("gps-dropout", "absolute-pose-drift"), ("absolute-pose-dropout", "gps-bias"),
     ("gps-bias", "absolute-pose-bias"), ("odom-dropout", "absolute-pose-dropout"),
-    ("imu-dropout", "gps-dropout"), ("odom-stuck", "gps-dropout"), ("imu-stuck", "odom-bias"),
-    ("gps-noise", "absolute-pose-noise"), ("imu-drift", "absolute-pose-stuck"),
-    ("gps-drift", "odom-dropout"),
-])
+    ("imu-dropout", "gps-dropout"), ("imu-stuck", "odom-bias"),
+    ("gps-noise", "absolute-pose-noise"), ("gps-drift", "odom-dropout")])
 def test_after_two_faults_it_is_roughly_right_or_says_nothing(names):
     assert run(*((name, 5.0 + 4 * i, FOR_EVER) for i, name in enumerate(names))).worst_m < 1.0
 
