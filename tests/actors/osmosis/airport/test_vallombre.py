@@ -30,18 +30,6 @@ def test_there_is_another_way_whichever_edge_is_closed():
         assert plan_route(AIRPORT.nodes, left, a, b).waypoints, edge
 
 
-def test_four_obstacles_can_be_passed_and_the_fifth_blocks_a_runway_for_a_while():
-    for preset in AIRPORT.obstacles[:4]:
-        assert AIRPORT.nearest_on_graph(preset.x_m, preset.y_m).distance_m < 0.5
-        # A passage as wide as the robot plus 0.3 m on either side remains on one side at least.
-        room_m = AIRPORT.prohibited_distance_m(preset.x_m, preset.y_m) - preset.radius_m
-        assert room_m > 0.614 + 2 * 0.3
-        assert preset.gone_after_s is None
-    blocker = AIRPORT.obstacles[4]
-    assert blocker.appears_within_m
-    assert blocker.gone_after_s
-
-
 def test_photometry_follows_the_inverse_square_and_the_cosine_law():
     assert illuminance_per_candela(0.0) == pytest.approx(1 / SENSOR_HEIGHT_M**2)
     # As far sideways as high: twice the square of the distance, cosine 1 / sqrt 2.

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.detection.erroneous_route import RouteMonitor
 from rampart.actors.osmosis.detection.mission_consistency import (
     ConsistencyLimits,
@@ -19,7 +18,6 @@ from rampart.actors.osmosis.detection.mission_consistency import (
 from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
 from rampart.testing import play, table, wake
 
-AIRPORT = load_airport("vallombre")
 GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))
 GOOD, BAD = ((0.0, 0.0), (10.0, 0.0)), ((0.0, 0.0), (10.0, 5.0))
 
@@ -85,7 +83,7 @@ def test_who_gave_a_wrong_goal_is_to_blame_for_the_bad_route_to_it(goal, status,
 class Story:
     """The chain in order, and what may be changed about it."""
 
-    def __init__(self):
+    def __init__(self, changes={}):
         self.mission = m.MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), "")
         self.goal = m.GoalOrder("m1", 0, GOALS[0], True)
         self.route = m.Route("m1", 0, Mode.TAXI, True, GOOD, "")
@@ -93,6 +91,8 @@ class Story:
         self.pose = (0.0, 0.0)
         self.lives = {"mission": 1, "goal": 1, "route": 1, "control": 1}
         self.silent: set[str] = set()
+        for what, fields in changes.items():
+            self.change(what, **fields)
 
     SOURCES = {"mission": "mission_manager", "goal": "mission_manager", "route": "graph_planner",
                "control": "osmosis_control"}
@@ -142,27 +142,31 @@ CONTRADICTIONS = {
                          "keeps goal 1, which is reached"),
     "a step beyond the last": ({"mission": {"step": 2}, "goal": {"step": 2}}, "mission_manager#1",
                                "goal 3"),
+    "running": ({}, "", ""),
+    "paused": ({**PAUSED, **IDLE_GOAL, **IDLE_ROUTE}, "", ""),
+    "returning home": (
+        {"mission": {"phase": MissionPhase.RETURNING}, "goal": {"step": 2}, "route": {"step": 2},
+         "control": {"step": 2}}, "", ""),
+    "over": (
+        {"mission": {"phase": MissionPhase.SUCCEEDED, "step": 2},
+         "goal": {"step": 2, "active": False}, "route": {"step": 2, "active": False},
+         "control": {"step": 1, "phase": ControlPhase.ARRIVED}}, "", ""),
 }
+"""What contradicts, who is named, and why; no name: it is consistent."""
 
 
 @pytest.mark.parametrize("case", CONTRADICTIONS.values(), ids=CONTRADICTIONS.keys())
 def test_a_lasting_contradiction_names_the_first_in_the_chain_who_is_wrong(case):
     changes, node, reason = case
-    story = Story()
-    watch(story, 1.0)
-    for what, fields in changes.items():
-        story.change(what, **fields)
-    monitor, found = watch(story, 4.0)
-    assert found == pytest.approx(2.5, abs=0.21)
-    assert monitor.nodes == (node,)
+    monitor, found = watch(Story(changes), 8.0)
+    assert found == (pytest.approx(2.5, abs=0.21) if node else None)
+    assert monitor.nodes == ((node,) if node else ())
     assert reason in monitor.reason
 
 
 @pytest.mark.parametrize(("changes", "knows"), [({}, True), ({"route": {"step": 3}}, False)])
 def test_a_respawned_module_knows_what_it_has_seen_whole_unless_it_is_contradictory(changes, knows):
-    story = Story()
-    for what, fields in changes.items():
-        story.change(what, **fields)
+    story = Story(changes)
     monitor = ConsistencyMonitor(ConsistencyLimits(), 0.0, known=False)
     monitor.take(story.mission, "mission_manager", 1, 0.0, 0.0)
     assert not monitor.known
@@ -170,23 +174,6 @@ def test_a_respawned_module_knows_what_it_has_seen_whole_unless_it_is_contradict
     assert (monitor.known, monitor.active) == (knows, False)
     monitor, found = watch(story, 4.0, monitor, 0.5)
     assert (found is None) is knows
-
-
-@pytest.mark.parametrize("changes", [
-    {},
-    {**PAUSED, **IDLE_GOAL, **IDLE_ROUTE},
-    {"mission": {"phase": MissionPhase.RETURNING}, "goal": {"step": 2}, "route": {"step": 2},
-     "control": {"step": 2}},
-    {"mission": {"phase": MissionPhase.SUCCEEDED, "step": 2},
-     "goal": {"step": 2, "active": False}, "route": {"step": 2, "active": False},
-     "control": {"step": 1, "phase": ControlPhase.ARRIVED}}],
-    ids=["running", "paused", "returning home", "over"])
-def test_states_of_a_healthy_chain_are_consistent(changes):
-    story = Story()
-    for what, fields in changes.items():
-        story.change(what, **fields)
-    _, found = watch(story, 8.0)
-    assert found is None
 
 
 @pytest.mark.parametrize("first_pose", [(0.0, 20.0), (1e300, 20.0)])
@@ -215,7 +202,7 @@ def test_an_arrival_that_is_not_reported_is_noticed_later(phase):
     assert monitor.active == (phase is ControlPhase.FOLLOWING)
 
 
-@pytest.mark.parametrize("stamp_s", [None, 1e9, math.inf, math.nan])
+@pytest.mark.parametrize("stamp_s", [None, 1e9, math.nan])
 @pytest.mark.parametrize(("what", "node"), Story.SOURCES.items())
 def test_who_falls_silent_is_named_also_after_a_stamp_of_no_possible_time(what, node, stamp_s):
     story = Story()

@@ -62,16 +62,6 @@ async def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_s
     assert ear.heard[-1][1].reason == ""
 
 
-@pytest.mark.parametrize(("parameter", "value", "expected"), [
-    *(("timeout_s", value, "a number") for value in ("soon", -1.0, True, None)),
-    ("suspects", "x", "a list")])
-@in_system()
-async def test_a_parameter_that_makes_no_sense_is_refused_by_name(
-        system, parameter, value, expected):
-    with pytest.raises(ValueError, match=rf"parameters\.{parameter} = .*: expected {expected}"):
-        system.start("DM2", Freshness, **{**COMMAND, "timeout_s": 1.0, parameter: value})
-
-
 @in_system()
 async def test_it_names_the_suspected_node_and_the_life_that_was_heard_last(system):
     ear = system.start("ear", Ear)

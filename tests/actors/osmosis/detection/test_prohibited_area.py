@@ -40,16 +40,11 @@ def fix(y_m: float, speed_mps: float, course_deg: float, x_m: float = 0.0) -> Gp
 
 
 @pytest.mark.parametrize(("y_m", "speed_mps", "course_deg", "alarm"), **table({
-    "straight at the edge, from the middle: there is room yet": (0.0, 1.0, 90.0, False),
-    "skirting an obstacle 1.5 m aside, along the edge": (1.5, 1.0, 0.0, False),
     "skirting it, nearly parallel, outward": (1.5, 1.0, 20.0, False),
-    "skirting it slowly, any course": (1.5, 0.4, 90.0, False),
     "straight at the edge, no room left": (1.5, 1.0, 90.0, True),
     "straight at the edge from 1 m aside": (1.0, 1.0, 90.0, False),
-    "running away from the middle at 3 m/s": (0.0, 3.0, 60.0, True),
     "standing with a corner nearly on the grass": (2.0, 0.0, 0.0, True),
     "the same, driving away from it": (2.0, 0.5, -90.0, True),
-    "standing on the grass": (2.6, 0.0, 0.0, True),
     "standing as near as is allowed": (1.95, 0.0, 0.0, False),
 }))
 def test_alarm_in_a_lane_of_5_m(y_m, speed_mps, course_deg, alarm):
@@ -111,9 +106,8 @@ STAMPS = {"o": 0.0, "+": 1e9, "i": math.inf, "t": math.nan}
     "fixes without numbers are none, nor a negative accuracy": ("mnwnwn", "---AAA"),
     "a velocity that cannot be is none": ("mvvvvv", "---AAA"),
     "and does no harm to those after it": ("mvmmvm", "------"),
-    "fixes from the future are none": ("m+++++", "---AAA"),
+    "fixes from the future or of no time are none": ("m+iti+", "---AAA"),
     "and shut out none": ("+mm+mm", "------"),
-    "nor those infinitely ahead or of no time": ("mititi", "---AAA"),
     "a fix from the future does not say that it is safe again": ("me++++", "-AAAAA"),
     "a frozen receiver": ("moooooo", "---AAAA"),
     "a receiver that has lost its accuracy is no barrier": ("mb", "-A"),

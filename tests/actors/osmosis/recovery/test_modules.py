@@ -172,18 +172,6 @@ async def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard(system
     assert system.incarnations["a"] == 2
 
 
-@pytest.mark.parametrize("answer", ["refused", "given up"])
-@in_system()
-async def test_what_the_supervisor_will_not_do_is_a_failure(system, answer):
-    boss, supervisor = await respawning(system)
-    supervisor.answer = answer
-    await system.kill("a")
-    boss.order("RM3", nodes=("a",))
-    await system.settle()
-    assert boss.phases == ["idle", "acting", "failed"]
-    assert boss.reports[-1].message.reason == f"a: {answer}"
-
-
 @in_system()
 async def test_a_supervisor_that_is_away_is_asked_until_the_deadline(system):
     boss, supervisor = await respawning(system)
@@ -198,21 +186,3 @@ async def test_a_supervisor_that_is_away_is_asked_until_the_deadline(system):
     supervisor.answer = "respawned"
     await asyncio.sleep(0.5)
     assert boss.phases == ["idle", "acting", "failed", "done"]
-
-
-@in_system()
-async def test_a_respawned_module_that_is_commanded_again_does_not_kill_who_is_well(system):
-    boss, supervisor = await respawning(system)
-    await system.kill("a")
-    boss.order("RM3", nodes=("a",))
-    await asyncio.sleep(0.3)
-    await system.kill("RM3")
-    await system.settle()
-    boss.reports.clear()
-    system.start("RM3", Respawn, nodes=["a", "b"])
-    await system.settle()
-    boss.order("RM3", nodes=("a",))
-    await asyncio.sleep(0.3)
-    assert boss.phases == ["idle", "acting", "done"]
-    assert system.incarnations["a"] == 2
-    assert len({r.request for _, r in supervisor.requests}) == 2
