@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 
 import msgspec
 import pytest
@@ -83,7 +84,7 @@ def test_who_gave_a_wrong_goal_is_to_blame_for_the_bad_route_to_it(goal, status,
 class Story:
     """The chain in order, and what may be changed about it."""
 
-    def __init__(self, changes={}):
+    def __init__(self, changes=MappingProxyType({})):
         self.mission = m.MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), "")
         self.goal = m.GoalOrder("m1", 0, GOALS[0], True)
         self.route = m.Route("m1", 0, Mode.TAXI, True, GOOD, "")
