@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
-from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, Motor
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.robot import WHEEL_NAMES
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.world import World
@@ -59,14 +59,6 @@ def model_of(sim: World) -> tuple[bytes, ...]:
         model.actuator_biasprm, model.dof_frictionloss, model.geom_friction))  # fmt: skip
 
 
-def affected(sim: World, injection: str = "f") -> int:
-    """End a fault and return in how many ticks it changed something."""
-    sim.order_fault(fault(STUCK, duration_s=0.0, injection=injection))
-    last = sim.fault_news()[-1]
-    assert (last.injection, last.finished) == (injection, True)
-    return last.affected_ticks
-
-
 # ---- stuck wheel --------------------------------------------------------------------
 
 
@@ -100,21 +92,6 @@ def test_the_less_of_the_brake_is_left_the_longer_the_way():
     assert ways[-1] == pytest.approx(84 * 0.1175**2 / (4 * 0.1), rel=0.1)
 
 
-def test_the_dead_man_brakes_in_vain_as_well_but_a_controlled_stop_does_not_need_the_brake():
-    sim = world(dead_man_timeout_s=0.4)
-    sim.order_fault(fault(BRAKE))
-    while sim.time_s < 3.0:
-        sim.command(1.0, 0.0)
-        after(sim, 0.1)
-    after(sim, 1.5)
-    assert sim.base_status().dead_man_tripped
-    assert sim.truth().twist.linear_mps > 0.5
-    for _ in range(10):
-        sim.command(0.0, 0.0)
-        after(sim, 0.1)
-    assert abs(sim.truth().twist.linear_mps) < 0.01
-
-
 def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_left():
     sim = driving()
     sim.order_fault(fault(BRAKE))
@@ -129,15 +106,10 @@ def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_lef
 # ---- several, and their ends --------------------------------------------------------
 
 
-@pytest.mark.parametrize("orders", [
-    [fault(STUCK, duration_s=1.0)],
-    [fault(WEAK, strength=0.1, duration_s=1.0)],
-    [fault(STUCK, "rear right", duration_s=1.0, injection="a"),
-     fault(WEAK, "front left", 0.2, 0.7, "b"), fault(BRAKE, "", 0.3, 0.4, "c")],
-])  # fmt: skip
-def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again(orders):
+def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again():
     sim = driving()
-    for order in orders:
+    for order in (fault(STUCK, "rear right", duration_s=1.0, injection="a"),
+                  fault(WEAK, "front left", 0.2, 0.7, "b"), fault(BRAKE, "", 0.3, 0.4, "c")):
         sim.order_fault(order)
     assert model_of(after(sim, 0.3)) != model_of(world())
     after(sim, 2.0)
@@ -145,78 +117,6 @@ def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again(orders
     assert not sim._faulty  # and the ticks cost what they did before
     assert abs(turned(sim, 3.0)) < 0.002
     assert sim.truth().twist.linear_mps == pytest.approx(1.0, abs=0.01)
-
-
-def test_a_duration_of_0_ends_one_fault_and_leaves_the_other():
-    sim = driving()
-    sim.order_fault(fault(STUCK, "front left", injection="a"))
-    sim.order_fault(fault(STUCK, "rear left", injection="b"))
-    after(sim, 0.2)
-    assert affected(sim, "a") == 20
-    after(sim, 0.3)
-    speeds = sim.base_status().wheel_speeds_radps
-    assert speeds[0] > 7.5
-    assert abs(speeds[2]) < 0.2
-    assert affected(sim, "b") == affected(sim, "b") == 50, "also when it is ended twice"
-    assert model_of(after(sim, 0.01)) == model_of(world())
-
-
-def test_a_fault_ordered_again_is_replaced_lasts_anew_and_goes_on_counting():
-    sim = driving()
-    sim.order_fault(fault(STUCK, "front left", duration_s=0.5))
-    after(sim, 0.3)
-    sim.order_fault(fault(STUCK, "rear right", duration_s=0.5))
-    after(sim, 0.4)
-    assert sim.base_status().wheel_speeds_radps[0] > 7.5
-    assert abs(sim.base_status().wheel_speeds_radps[3]) < 0.2
-    after(sim, 1.0)
-    assert sim.fault_news()[-1] == FaultNews("f", 80, finished=True)
-
-
-def test_the_worst_of_several_faults_on_an_actuator_acts_and_counts():
-    sim = driving()
-    for injection, order in {
-        "stuck": fault(STUCK), "hidden": fault(WEAK, strength=0.1),
-        "weakest": fault(WEAK, "rear right", 0.1), "weaker": fault(WEAK, "rear right", 0.2),
-    }.items():  # fmt: skip
-        sim.order_fault(m.ActuatorFault(injection, order.kind, order.wheel, order.strength, 9.0))
-    after(sim, 0.5)
-    counts = {name: affected(sim, name) for name in ("stuck", "hidden", "weakest", "weaker")}
-    assert counts == {"stuck": 50, "hidden": 0, "weakest": 50, "weaker": 0}
-
-
-# ---- what changes nothing -----------------------------------------------------------
-
-
-@pytest.mark.parametrize("order", [fault(STUCK), fault(WEAK), fault(BRAKE, strength=0.5)])
-def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
-    sim = world()
-    sim.brake(True)
-    after(sim, 0.5)
-    sim.order_fault(order)
-    after(sim, 1.0)
-    assert affected(sim) == 0
-
-
-# ---- bad input ----------------------------------------------------------------------
-
-BAD = [
-    (fault(STUCK, "middle left"), "wheel = 'middle left': expected one of front left"),
-    (fault(WEAK, strength=-0.1), "strength = -0.1: expected a share from 0 to 1"),
-    (fault(BRAKE, strength=math.nan), "strength = nan: expected a share"),
-    (fault(STUCK, duration_s=math.nan), "duration_s = nan: expected seconds"),
-    (fault(STUCK, duration_s=0.0), "injection = 'f': unknown fault, nothing to end")]
-
-
-@pytest.mark.parametrize(("order", "reason"), BAD)
-def test_an_impossible_fault_is_refused_in_one_line_and_changes_nothing(order, reason):
-    sim = driving()
-    with pytest.raises(WorldError) as refusal:
-        sim.order_fault(order)
-    assert reason in str(refusal.value)
-    assert "\n" not in str(refusal.value)
-    assert sim.fault_news() == []
-    assert after(sim, 0.1).truth() == after(driving(), 0.1).truth()
 
 
 # ---- the pure part ------------------------------------------------------------------
@@ -259,6 +159,53 @@ def test_no_wheel_gets_more_than_a_healthy_one_and_only_faulty_wheels_get_less(
                 assert actuation.targets_radps[i] == targets[i]
 
 
+def news(subject, ticks=0, asked=(8.5,) * 4, speeds=(8.5,) * 4, braking=False):
+    """What is new after so many ticks: fault, ticks in which it changed something, it is over."""
+    for _ in range(ticks):
+        subject.actuate(asked, speeds, braking)
+    return [(one.injection, one.affected_ticks, one.finished) for one in subject.take_news()]
+
+
+def test_faults_are_replaced_and_ended_by_name_and_the_worst_on_an_actuator_counts():
+    subject = ActuatorFaults(MOTOR)
+    for name, kind, wheel, strength in (
+            ("stuck", STUCK, "front left", 0.0), ("hidden", WEAK, "front left", 0.1),
+            ("weakest", WEAK, "rear right", 0.1), ("weaker", WEAK, "rear right", 0.2)):
+        subject.order(fault(kind, wheel, strength, injection=name), 0.0)
+    news(subject, ticks=50)
+    subject.order(fault(STUCK, "rear left", duration_s=1.0, injection="stuck"), 0.5)
+    assert news(subject, ticks=10) == [("stuck", 50, False), ("hidden", 1, False)]
+    subject.expire(1.5)
+    for name in ("weaker", "weakest", "weakest"):  # also when it is ended twice
+        subject.order(fault(WEAK, duration_s=0.0, injection=name), 1.5)
+    assert news(subject) == [("stuck", 60, True), ("weaker", 0, True), ("weakest", 60, True),
+                             ("weakest", 60, True)]
+
+
+@pytest.mark.parametrize("order", [fault(STUCK), fault(WEAK), fault(BRAKE, strength=0.5)])
+def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
+    subject = ActuatorFaults(MOTOR)
+    subject.order(order, 0.0)
+    still = (0.0,) * 4
+    assert news(subject, 9, still, still, braking=True) == [("f", 0, False)]
+
+
+BAD = [
+    (fault(STUCK, "middle left"), "wheel = 'middle left': expected one of front left"),
+    (fault(BRAKE, strength=math.nan), "strength = nan: expected a share"),
+    (fault(STUCK, duration_s=math.nan), "duration_s = nan: expected seconds"),
+    (fault(STUCK, duration_s=0.0), "injection = 'f': unknown fault, nothing to end")]
+
+
+@pytest.mark.parametrize(("order", "reason"), BAD)
+def test_an_impossible_fault_is_refused_and_changes_nothing(order, reason):
+    subject = ActuatorFaults(MOTOR)
+    with pytest.raises(WorldError, match=reason):
+        subject.order(order, 0.0)
+    assert not subject
+    assert news(subject) == []
+
+
 # ---- the actor ----------------------------------------------------------------------
 
 
@@ -267,31 +214,22 @@ def reports(bench: Bench) -> list[tuple[str, int, bool, str]]:
             for r in bench.all(bus_topics.INJECTION_REPORT)]
 
 
-def ordered(order: m.ActuatorFault) -> Bench:
-    """A simulator whose robot drives when a fault is ordered."""
-    bench = Bench()
-    bench.run(1.0, FORWARD)
-    bench.actor.actuator_fault(order, bench.header())
-    return bench
-
-
 FORWARD = m.BaseCommand(1.0, 0.0)
 
 
-def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_and_when_it_is_over():
-    bench = ordered(fault(STUCK, duration_s=0.5))
+def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_when_it_is_over_or_refused():
+    bench = Bench()
+    bench.run(1.0, FORWARD)
+    bench.actor.actuator_fault(fault(STUCK, duration_s=0.5), bench.header())
     assert reports(bench) == [("f", 0, False, "")]
     bench.run(0.1, FORWARD)
     assert reports(bench)[1:] == [("f", 1, False, "")]
     bench.run(1.0, FORWARD)
     assert reports(bench)[2:] == [("f", 50, True, "")]
     assert bench.complaints == []
-
-
-def test_the_simulator_refuses_what_is_impossible_and_says_why():
     order, reason = BAD[0]
-    bench = ordered(order)
-    ((injection, count, finished, why),) = reports(bench)
-    assert (injection, count, finished) == ("f", 0, True)
+    bench.actor.actuator_fault(order, bench.header())
+    (name, count, finished, why), = reports(bench)[3:]
+    assert (name, count, finished) == ("f", 0, True)
     assert reason in why
     assert bench.complaints == [("actuator fault", why, "tester")]

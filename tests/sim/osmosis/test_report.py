@@ -155,21 +155,19 @@ def test_the_page_is_self_contained_escaped_and_shows_everything():
     assert "gone" not in html
 
 
-def test_both_files_are_written_whole_in_their_folder_or_the_old_ones_stay(tmp_path, monkeypatch):
+def test_a_report_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
     run = full_story("../../etc/x y").end()
-    html, data, problem = try_report(run, render, tmp_path / "deep" / "er")
-    assert (problem, html.parent) == ("", tmp_path / "deep" / "er")
-    assert sorted(html.parent.iterdir()) == [html, data]
+    html, data, problem = try_report(run, render, tmp_path / "deep")
+    assert (problem, sorted(html.parent.iterdir())) == ("", [html, data])
     assert msgspec.json.decode(data.read_bytes(), type=MissionRecord) == run
     before = html.read_text()
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.replace", fail)
+    monkeypatch.setattr("pathlib.Path.replace", no_space)
     assert "No space" in try_report(run, lambda _: "other", html.parent).problem
-    assert html.read_text() == before
-    assert len(list(html.parent.iterdir())) == 2
+    assert (html.read_text(), sorted(html.parent.iterdir())) == (before, [html, data])
+
+
+def no_space(*_):
+    raise OSError(28, "No space left on device")
 
 
 # ---- a run that is resumed ------------------------------------------------------------
@@ -189,13 +187,14 @@ def told_of_the_beginning(story: Story) -> None:
         "hmi", "respawned", 7, 2, "supervisor", ""))
 
 
-def test_the_record_of_a_resumed_run_covers_both_parts():
+def test_the_record_of_a_resumed_run_covers_both_parts_and_the_judge_knows_what_it_saw():
     before, after = Story(), Story()
     told_of_the_beginning(before)
     found = after.recorder.recall(before.recorder.memory(20.0))
     assert found.duration_s == 20.0
     goal = MISSION.goals[1]
-    after.truth(40.0, goal.x_m, goal.y_m, collisions=0)
+    after.truth(40.0, goal.x_m, goal.y_m)  # the Mission Manager has not been heard again yet
+    assert len(after.recorder.judge.visit_times_s) == 2, "judged in the mode of before the cut"
     after.tell(40.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
         "hmi", "respawned", 7, 2, "supervisor", ""))
     run = after.end(60.0)
@@ -208,16 +207,9 @@ def test_the_record_of_a_resumed_run_covers_both_parts():
     assert any("cut off" in event.text for event in run.events)
 
 
-def test_the_judge_knows_what_it_saw_before_and_judges_the_cut_in_the_mode_of_before():
-    before, after = Story(), Story()
-    told_of_the_beginning(before)
-    after.recorder.recall(before.recorder.memory(20.0))
-    goal = MISSION.goals[1]
-    after.truth(30.0, goal.x_m, goal.y_m)  # the Mission Manager has not been heard again yet
-    assert len(after.recorder.judge.visit_times_s) == 2
-    unsafe = Story()
+def test_what_was_unsafe_before_a_cut_stays_so():
+    unsafe, later = Story(), Story()
     unsafe.truth(5.0, 0.0, 0.0, collisions=1)
-    later = Story()
     later.recorder.recall(unsafe.recorder.memory(6.0))
     later.truth(9.0, 0.0, 0.0, collisions=0)
     verdict = later.recorder.judge.verdict()

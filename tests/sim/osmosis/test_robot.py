@@ -64,16 +64,6 @@ def test_a_controlled_stop_takes_less_than_25_cm_and_the_brake_less(brakes, leas
     assert sim.base_status().brake_engaged is brakes
 
 
-def test_a_braked_robot_stands_still_and_drives_again_when_released():
-    sim = world()
-    sim.brake(True)
-    run(sim, 1.0, 0.5, 3)
-    assert math.hypot(*sim.pose[:2]) < 0.002
-    sim.brake(False)
-    sim.step_to(sim.time_s + 3)
-    assert sim.pose[0] > 0.5
-
-
 def test_it_stays_on_its_wheels_whatever_is_commanded():
     sim = world()
     for linear, angular in [(3, 3), (-3, 3), (3, -3), (0, 3), (-3, 0), (3, 0)] * 2:

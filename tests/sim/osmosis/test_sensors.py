@@ -51,18 +51,6 @@ def test_the_laser_measures_the_distance_to_an_obstacle_from_the_robots_centre(
     assert sim.scan()[index] == pytest.approx(expected, abs=0.005)
 
 
-def test_the_laser_sees_buildings_and_obstacles_that_appear_move_and_go():
-    wall = Building("Wall", 5.0, 0.0, 0.2, 20.0, 3.0)
-    sim = world(field(buildings=(wall,)), laser=LaserSpec(noise_m=0.0))
-    assert towards(sim, sim.scan(), 0.0) == pytest.approx(4.9)
-    sim.add_obstacle("somebody", 3.0, 0.0, 0.5)
-    assert towards(sim, sim.scan(), 0.0) == pytest.approx(2.5)
-    sim.add_obstacle("somebody", 2.0, 0.0, 0.25)
-    assert towards(sim, sim.scan(), 0.0) == pytest.approx(1.75)
-    assert sim.remove_obstacle("somebody")
-    assert towards(sim, sim.scan(), 0.0) == pytest.approx(4.9)
-
-
 def test_laser_and_gps_have_the_stated_noise_and_no_bias():
     sim = world(field(buildings=(Building("Wall", 3.1, 0.0, 0.2, 4.0, 3.0),)))
     for errors, sigma_m in (
