@@ -1,8 +1,7 @@
-"""`rampart mission` against a living Mission Manager over Zenoh, and which orders it offers."""
+"""`rampart mission` against a living Mission Manager over Zenoh."""
 
 from __future__ import annotations
 
-import itertools
 import json
 
 import pytest
@@ -12,10 +11,8 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
-from rampart.actors.osmosis.control.mission.mission_state import MissionState, obey, status
-from rampart.actors.osmosis.messages import MissionAction, MissionPhase
+from rampart.actors.osmosis.messages import MissionPhase
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.run_context import RunContext
 from tests.cli.test_verbs_live import Run, running
@@ -73,30 +70,3 @@ async def test_without_an_answer_the_verb_says_so(run, monkeypatch):
     code, out, err = await run.call("mission", "pause")
     assert (code, out) == (1, "")
     assert err == "rampart: no effect: the Mission Manager did not answer within 0.5 s\n"
-
-
-def test_the_status_offers_exactly_the_orders_that_are_then_obeyed():
-    """Breadth first: every state that three events can lead to, each order tried in each."""
-    orders = [lambda s, i=i, a=a: obey(s, m.MissionOrder(f"o{i}{a}", a, "why", "operator"), 1.0)[0]
-              for i, a in itertools.product(range(2), MissionAction)]
-    events = [
-        *orders,
-        lambda s: mission_state.accept(s, REQUEST, 0.0),
-        lambda s: mission_state.hold(s, "held by RM2"),
-        lambda s: mission_state.hold(s, ""),
-        lambda s: mission_state.routed(s, m.Route(
-            s.mission_id, s.step, m.Mode.TAXI, True, ((0.0, 0.0),), "")),
-    ]
-    states = {MissionState(): None}
-    for _ in range(3):
-        states |= {event(state): None for state in states for event in events}
-    offered = set()
-    for state in states:
-        obeyed = tuple(
-            action for action in MissionAction
-            if obey(state, m.MissionOrder("new", action, "why", "operator"), 1.0)[1].accepted)
-        assert set(status(state).orders) == set(obeyed)
-        offered.add((state.phase, bool(state.held), obeyed))
-    assert len(offered) > 10
-    assert {phase for phase, _, obeyed in offered if not obeyed} == {
-        MissionPhase.IDLE, MissionPhase.FAILED, MissionPhase.CANCELLED}

@@ -56,16 +56,6 @@ def test_the_robot_waits_for_an_obstacle_and_resumes_a_moment_after_it_is_gone()
     assert drive(world, row, 40).arrived
 
 
-def test_an_obstacle_that_flickers_is_waited_for():
-    world = World()
-
-    def flicker(now):
-        world.circles[:] = [] if int(now / 0.5) % 2 else [Circle(8.0, 0.0, 0.4)]
-
-    assert not drive(world, LightRow(ROW), 30, each=flicker).arrived
-    assert world.least_clearance_m > 0.5
-
-
 def test_a_standby_goes_back_where_the_active_one_does_and_stops_when_it_does():
     row = LightRow(((0.0, 0.0), (40.0, 0.0)), limits=RowLimits(pass_after_s=5.0),
                    edge_m=lambda _x, _y: 9.0)

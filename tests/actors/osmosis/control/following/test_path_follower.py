@@ -1,11 +1,10 @@
-import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.following.path_follower import PathFollower, field, repulsion
+from rampart.actors.osmosis.control.following.path_follower import PathFollower, field
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import Polyline
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive
@@ -43,24 +42,6 @@ def test_obstacles_are_passed_and_the_robot_is_back_on_the_line(circles):
     if len(circles) == 1 and circles[0].y_m:
         beside = [y for x, y in world.track if abs(x - 10.0) < 0.3]
         assert all(y * circles[0].y_m < 0 for y in beside), "on the other side"
-
-
-@pytest.mark.parametrize("seed", [
-    0, 1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(2, 8))])
-def test_random_obstacles_on_a_bent_route_are_passed(seed):
-    rng = np.random.default_rng(seed)
-    angle = rng.uniform(-1.2, 1.2)
-    route = [(0.0, 0.0), (12.0, 0.0), (12.0 + 14 * math.cos(angle), 14 * math.sin(angle))]
-    line = Polyline(route)
-    circles = []
-    for i in range(3):
-        x, y = line.point_at(4 + 6.5 * i + rng.uniform(0, 2))
-        circles.append(Circle(x + rng.uniform(-0.8, 0.8), y + rng.uniform(-0.8, 0.8),
-                              rng.uniform(0.2, 0.6)))
-    world = World(circles=circles)
-    assert drive(world, PathFollower(tuple(route)), 90, gate).arrived
-    assert world.least_clearance_m >= 0.2
-    assert world.deviation(route) <= 1.6
 
 
 def test_a_closed_corridor_is_waited_for_and_gone_through_when_it_opens():
@@ -111,18 +92,6 @@ def test_speed_turn_and_accelerations_stay_within_limits():
         last = now
         world.move(*now)
     assert motion.arrived
-
-
-@pytest.mark.parametrize("along", [0, 1])
-def test_repulsion_pushes_away_the_more_the_nearer_and_only_within_its_influence(along):
-    def push(distance_m):
-        echo = np.zeros((1, 2))
-        echo[0, along] = distance_m + (HULL.half_length_m if along == 0 else HULL.half_width_m)
-        return repulsion(echo, HULL)
-
-    near, nearer = push(0.3), push(0.1)
-    assert nearer[along] < near[along] < 0.0 == near[1 - along]
-    assert push(0.91) == (0.0, 0.0)
 
 
 @given(st.floats(-0.3, 0.3), st.floats(0.4, 2.0))

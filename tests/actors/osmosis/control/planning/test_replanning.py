@@ -110,7 +110,7 @@ def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_b
     ids=["as in the paper", "no room on the pavement", "both sides are blocked"])
 def test_else_it_waits_and_touches_nothing(follower, aside_m):
     world = World(circles=[Circle(12.0, y_m, 0.4) for y_m in aside_m])
-    motion = drive(world, follower(), 60.0)
+    motion = drive(world, follower(), 30.0)
     assert not motion.arrived
     assert motion.linear_mps == 0.0
     assert world.least_clearance_m >= 0.2
