@@ -21,49 +21,15 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import eventually
-from tests import ROOT
+from tests import ROOT, TANK
 from tests.actors.operator.world import Others
 from tests.tank import GAUGE, LEVEL, PUMP, TOPICS, VALVE, Level, Phase, Pump
 
-SYSTEM = """
-name = "tank"
-title = "A tank"
-[timing]
-heartbeat_timeout_s = 0.5
-command_timeout_s = 1.0
-localization_timeout_s = 1.0
-scan_timeout_s = 1.0
-dead_man_timeout_s = 1.0
-manager_timeout_s = 1.0
-detection_silence_timeout_s = 1.0
+WORKS = """
 [[node]]
 name = "pump"
 actor = "tests.actors.operator.test_panels:Works"
 kind = "control"
-[[node]]
-name = "manager"
-actor = "rampart.manager.actor:FtmManager"
-kind = "manager"
-[[detection]]
-name = "D"
-title = "d"
-actor = "rampart.actors.detection.stub:StubDetection"
-within_s = 0.2
-[[recovery]]
-name = "R"
-title = "r"
-actor = "rampart.actors.recovery.stub:StubRecovery"
-kind = "forward"
-[[mechanism]]
-name = "M"
-detect = "D"
-recover = "R"
-event = "overflow"
-against = { within_s = 60.0, hazard = "it runs over" }
-[[event]]
-name = "overflow"
-[orders.safer]
-R = []
 """
 PAGE = """
 [[node]]
@@ -92,8 +58,8 @@ class OwnHmi(Hmi):
 
 
 def layout(panels: str = "", page: str = PAGE) -> Layout:
-    text = SYSTEM + page + panels
-    return Layout(RunPlan(system_file="tank.toml"), parse_specification(text, "tank.toml"))
+    return Layout(RunPlan(system_file="tank.toml"),
+                  parse_specification(TANK + WORKS + page + panels, "tank.toml"))
 
 
 def shown(found: Layout) -> list[tuple[str, str]]:

@@ -41,14 +41,6 @@ def test_boxes_lie_apart_within_the_drawing_and_lines_join_them_to_the_right(nam
         assert all(x1 <= x2 for (x1, _), (x2, _) in pairwise(line.points))
 
 
-def test_the_way_of_an_event_ends_at_the_first_barrier_above():
-    way = {box.name: box.way for box in draw_system(system("osmosis"))["tree"].boxes}
-    assert way["control_node_crash"] == ("command_not_updated",)
-    assert way["command_out_of_bounds"] == (
-        "command_calculation_error", "erroneous_command", "moving_inside_prohibited_area")
-    assert way["moving_inside_prohibited_area"] == ()
-
-
 def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
     spec = system("paper")
     leaf = next(event for event in spec.events if not event.of)
@@ -67,49 +59,27 @@ def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
 # ---- processes -----------------------------------------------------------------------------------
 
 
-class Kernel:
-    """Processes that use half a core each."""
+def test_nodes_and_guards_that_exist_are_measured_and_processes_of_another_run_are_not():
+    alive, now_s = {10, 11, 20, 30}, 100.0
 
-    def __init__(self) -> None:
-        self.now_s = 100.0
-        self.alive = {10, 11, 20, 30}
-        self.found = [RunProcess(10, 7450, 5, ("hmi",), 1),
-                      RunProcess(20, 7450, 5, ("pool",), 3),
-                      RunProcess(30, 7450, 99, ("pool",), 1)]
+    def count(pid: int) -> ProcessCount | None:
+        return ProcessCount((now_s - 90) / 2, 50_000_000, 90.0) if pid in alive else None
 
-    def count(self, pid: int) -> ProcessCount | None:
-        return ProcessCount((self.now_s - 90) / 2, 50_000_000, 90.0) if pid in self.alive else None
+    def table(**pids: int) -> m.NodeTable:
+        return m.NodeTable(tuple(m.NodeInfo(name, "control", pid, m.NodeState.RUNNING, 1, 0)
+                                 for name, pid in pids.items()))
 
-    def find(self, _port: int) -> list[RunProcess]:
-        return self.found
-
-    def observer(self) -> ProcessObserver:
-        return ProcessObserver(
-            7450, 5, meter=UsageMeter(self.count, lambda: self.now_s), find=self.find,
-            state=lambda pid: "S" if pid in self.alive else "X")
-
-
-def table(**pids: int) -> m.NodeTable:
-    return m.NodeTable(tuple(
-        m.NodeInfo(name, "control", pid, m.NodeState.RUNNING, 1, 0) for name, pid in pids.items()))
-
-
-def test_nodes_and_guards_are_looked_at_and_processes_of_another_run_are_not():
-    kernel = Kernel()
-    looked = kernel.observer().look(table(hmi=10, localization=11))
-    assert looked["nodes"] == {
-        name: {"cpu": 50.0, "mb": 50.0, "age_s": 10}
-        for name in ("hmi", "localization", "pool")}
+    observer = ProcessObserver(
+        7450, 5, meter=UsageMeter(count, lambda: now_s), find=lambda _port: [
+            RunProcess(10, 7450, 5, ("hmi",), 1), RunProcess(20, 7450, 5, ("pool",), 3),
+            RunProcess(30, 7450, 99, ("pool",), 1)],
+        state=lambda pid: "S" if pid in alive else "X")
+    looked = observer.look(None)  # without a table no process is taken for a guard
+    assert ([g["name"] for g in looked["guards"]], looked["nodes"]) == (["launch.py"], {})
+    looked = observer.look(table(hmi=10, localization=11))
+    assert looked["nodes"] == {name: {"cpu": 50.0, "mb": 50.0, "age_s": 10}
+                               for name in ("hmi", "localization", "pool")}
     assert [(g["name"], g["pid"], g["state"], g["restarts"]) for g in looked["guards"]] == [
         ("launch.py", 5, "crashed", 0), ("pool", 20, "running", 2)]
-
-
-def test_a_dead_process_has_no_figures_and_without_a_table_nobody_is_taken_for_a_guard():
-    kernel = Kernel()
-    observer = kernel.observer()
-    looked = observer.look(None)
-    assert ([g["name"] for g in looked["guards"]], looked["nodes"]) == (["launch.py"], {})
-    observer.look(table(hmi=10))
-    kernel.alive = {20}
-    kernel.now_s += 1
+    alive, now_s = {20}, 101.0
     assert set(observer.look(table(hmi=10, never=0))["nodes"]) == {"pool"}

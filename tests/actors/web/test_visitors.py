@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rampart.actors.web.visitors import (
     MOST,
@@ -48,17 +46,6 @@ def test_what_is_no_list_of_visitors_is_one_line(lines, why):
         parse(lines)
     assert str(error.value).startswith(why)
     assert "\n" not in str(error.value)
-
-
-@given(st.lists(st.text(max_size=90), max_size=4))
-def test_whatever_is_in_a_file_is_read_or_refused_in_one_line(lines):
-    told, found = "one line", {}
-    try:
-        found = parse(lines)
-    except VisitorError as error:
-        told = str(error)
-    assert len(told.splitlines()) == 1
-    assert {v.role for v in found.values()} <= set(Role)
 
 
 def test_a_token_is_issued_once_kept_as_a_digest_and_revoked(tmp_path):
