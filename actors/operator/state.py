@@ -36,22 +36,14 @@ LARGEST = 1e15
 
 
 class Heard(msgspec.Struct):
-    """The latest message, and whether the next one is overdue; pages see {"value", "stale"}."""
+    """The latest message, as pages see it, and whether the next one is overdue.
+
+    `t` is the stamp of the message, if a page needs it.
+    """
 
     value: Any
     stale: bool = False
     t: float = 0.0
-    """Stamp of the message, if a page needs it."""
-
-
-def _timed(heard: Heard | None) -> dict[str, Any] | None:
-    return None if heard is None else {
-        "value": heard.value, "stale": heard.stale, "t": round(heard.t, 3)}
-
-
-def as_heard(heard: Heard | None) -> dict[str, Any] | None:
-    """Return a section in the form for pages."""
-    return None if heard is None else {"value": heard.value, "stale": heard.stale}
 
 
 class Trace:
@@ -114,20 +106,20 @@ class HmiState:
         if kept_s:
             self._traces[name] = Trace(kept_s)
         self._patience_s[name] = silent_s
-        self.aged(name, show=_timed if kept_s else as_heard)
+        self.aged(name)
 
     def field(self, name: str, value: Any, stamp_s: float, now_s: float) -> None:
         """Keep the value of a declared field, and its past if a panel shows it."""
         trace = self._traces.get(name)
         if trace is not None:
             trace.add(stamp_s, value)
-        self.put(name, Heard(value, t=stamp_s if trace is not None else 0.0), now_s)
+        self.put(name, Heard(value, t=0.0 if trace is None else round(stamp_s, 3)), now_s)
 
     def past(self) -> dict[str, list[tuple[float, Any]]]:
         """Return the past of each plotted field: simulated seconds, and value."""
         return {name: list(trace.points) for name, trace in self._traces.items()}
 
-    def aged(self, *names: str, show: Callable[[Heard | None], Any] = as_heard) -> None:
+    def aged(self, *names: str, show: Callable[[Heard | None], Any] = lambda heard: heard) -> None:
         """Declare sections that become stale without messages."""
         for name in names:
             self._aged.append(name)
@@ -147,8 +139,7 @@ class HmiState:
     def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
         """Keep the manager's status, and log changes of detections."""
         self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
-        self._heard_s["manager"] = now_s
-        self.picture.put("manager", Heard(status))
+        self.keep("manager", status, now_s)
         self._show_detections(False)
         for name, view in self._detections.items():
             self._log_lines(self.narrator.detection(name, view.active, view.reason), now_s)

@@ -34,7 +34,6 @@ class Faults:
 
     Class attributes:
         named: Disturbances of topics by name; the group of each is its kind.
-        left_out: Names that a user may try, and why there is no such fault.
         others: By kind, faults that do not disturb topics, as a campaign draws them.
         titled: Those of `others` that the operator's page offers: name → kind and title.
         kinds: All kinds with their titles, in the order of tables.
@@ -42,7 +41,6 @@ class Faults:
     """
 
     named: Mapping[str, Fault] = {}
-    left_out: ClassVar[Mapping[str, str]] = {}
     others: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     titled: ClassVar[Mapping[str, tuple[str, str]]] = {}
     kinds: Mapping[str, str] = {"none": "no fault", "topic": "topics",
@@ -83,8 +81,6 @@ class Faults:
         mode, colon, key = name.partition(":")
         if colon:
             return topic_fault(mode, key, seed, known, self.sizes)
-        if name in self.left_out:
-            raise UnknownFaultError(f"no fault {name!r}: {self.left_out[name]}")
         near = difflib.get_close_matches(name, self.named, 1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise UnknownFaultError(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rampart.actors.operator.bounds import MAX_NAME, Bounds
-from rampart.actors.operator.state import Heard, HmiState, as_heard
+from rampart.actors.operator.state import Heard, HmiState
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.messages import LaserScan
 from rampart.actors.osmosis.page.map import MAX_LIGHTS
@@ -46,8 +46,7 @@ class OsmosisState(HmiState):
         self._lights = None if lights is None else frozenset(lights)
         self._mission_id = ""
         self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
-        self.aged("control", "pilot")
-        self.aged("pose", show=_with_time)
+        self.aged("control", "pilot", "pose")
         self.aged("laser", "upper_laser", show=_sweep)
         self.aged("mission", show=_mission)
         self.picture.section("route", (), _route, _ROUTE)
@@ -56,7 +55,7 @@ class OsmosisState(HmiState):
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Keep the pose, and a point of the track if the robot has moved."""
-        self.put("pose", Heard(pose, False, stamp_s), now_s)
+        self.put("pose", Heard(pose, False, round(stamp_s, 4)), now_s)
         at = (pose.x_m, pose.y_m)
         if all(map(math.isfinite, at)) and (
                 not self.track or math.dist(self.track[-1], at) >= TRACK_STEP_M):
@@ -92,10 +91,6 @@ class OsmosisState(HmiState):
                 rows[name] = {"verdict": each.verdict, "ratio": round(each.ratio, 3),
                               "intensity_cd": round(each.intensity_cd, 1)}
         self.picture.put("lights", rows)
-
-
-def _with_time(heard: Heard | None) -> dict[str, Any] | None:
-    return None if heard is None else {**(as_heard(heard) or {}), "t": round(heard.t, 4)}
 
 
 def _sweep(heard: Heard | None) -> dict[str, Any] | None:

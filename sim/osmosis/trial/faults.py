@@ -152,13 +152,9 @@ SENSORS = (
                   "noise": "has noise of 1 rad/s on each wheel"}))
 """The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m cause 1633 lux
 (`rampart.actors.osmosis.airport.photometry`), so with 800 lux a failed light is near the limit of
-half its intensity."""
-
-LEFT_OUT: Mapping[str, str] = {
-    "laser-drift": "time of flight depends on a quartz, which drifts by millimetres an hour",
-    "light-drift": "a photodiode ages over years; within a mission that is light-bias"}
-"""Omitted combinations and why. A bias of odometry affects its twist only, since the origin of
-`odom` is arbitrary (REP-105)."""
+half its intensity. A laser does not drift: its time of flight depends on a quartz. Nor does the
+light sensor: a photodiode ages over years. A bias of odometry affects its twist only, since the
+origin of `odom` is arbitrary (REP-105)."""
 
 
 def _faults_of(sensor: _Sensor) -> list[Fault]:
@@ -228,7 +224,6 @@ class OsmosisFaults(Faults):
 
     named = {**PAPER_FAULTS, **SENSOR_FAULTS, **FROZEN_SETS}
     sizes = SIZES
-    left_out = LEFT_OUT
     others = {
         "actuator": (*(f"stuck-wheel:{wheel}" for wheel in _WHEELS),
                      *(f"weak-wheel:{wheel}:{_WEAK}" for wheel in _WHEELS),

@@ -182,7 +182,7 @@ async def test_the_latest_value_of_each_field_is_shown_and_what_was_plotted_late
                          and picture.value("manager/status:strategy") is not None)
         assert page._state.latched == ("RM1",)  # the page's own handler hears it too
         now = json.loads(msgspec.json.encode(picture.changes(0)))
-        assert now["tank/level:cells[max]"] == {"value": 1.0, "stale": False}
+        assert now["tank/level:cells[max]"] == {"value": 1.0, "stale": False, "t": 0.0}
         assert now["tank/valve:shut"] is None
         assert (now["tank/level:height_m"]["value"], now["tank/pump:phase"]["value"],
                 now["manager/status:strategy"]["value"]) == (0.3, "filling", "safety-first")
