@@ -96,7 +96,14 @@ class BlackBoxWriter:
         self._now_s = self._tidied_s = -math.inf
         self.messages = 0
 
-    def take(self, frame: bytes) -> None:
+    def write(self, frames: list[bytes], turn_s: float = 0.0) -> None:
+        """See `RunWriter`."""
+        del turn_s
+        for frame in frames:
+            with contextlib.suppress(ValueError):  # not from a node
+                self._take(frame)
+
+    def _take(self, frame: bytes) -> None:
         """Add a message as it was handed over.
 
         Raises:
@@ -142,12 +149,13 @@ class BlackBoxWriter:
             self._reported = self._history.problem
             complain(self._reported)
 
-    def close(self, *, is_cut_off: bool = False) -> None:
+    def end(self, why: str = "", *, is_cut_off: bool = False) -> None:
         """Keep only the messages of incidents, or all if the run was cut off.
 
         Raises:
             OSError: the disk is full, or it cannot be written.
         """
+        del why
         if self._last is not None and not is_cut_off:
             self._last = msgspec.structs.replace(
                 self._last, to_s=min(self._last.to_s, self._now_s))
@@ -243,39 +251,13 @@ class BlackBox(RunListener):
         super().__init__(port, folder, launcher)
         self._limits, self._again = limits, again
 
-    def begin(self, info: RunInfo, frames: list[bytes]) -> None:
+    def begin(self, info: RunInfo, frames: list[bytes]) -> BlackBoxWriter:
         """See `RunListener`."""
         del frames
         documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                             nodes=tuple(info.nodes), started=incidents.iso(time.time()))
-        self._box = BlackBoxWriter(
+        return BlackBoxWriter(
             self.path, documents, self._limits, origin_s=info.origin_s, again=self._again)
-
-    def write(self, frames: list[bytes], turn_s: float) -> None:
-        """See `RunListener`."""
-        del turn_s
-        for frame in frames:
-            with contextlib.suppress(ValueError):  # not from a node
-                self._box.take(frame)
-
-    def flush(self) -> None:
-        """See `RunListener`."""
-        self._box.flush()
-
-    def end(self, why: str, *, is_cut_off: bool) -> None:
-        """See `RunListener`."""
-        del why
-        self._box.close(is_cut_off=is_cut_off)
-
-    def abandon(self) -> None:
-        """See `RunListener`."""
-        if self._info is not None:
-            self._box.abandon()
-
-    @property
-    def messages(self) -> int:
-        """See `RunListener`."""
-        return self._box.messages if self._info is not None else 0
 
 
 def _living() -> set[str]:

@@ -216,8 +216,8 @@ def result_of(recorder: Recorder) -> str:
         return f"{recorder.path}: nothing was recorded"
     if not recorder.path.exists():
         return f"{recorder.path}: was removed while it was written: nothing is recorded"
-    lost = sum(recorder.writer.gaps.lost().values())
-    garbage = f", {recorder.writer.garbage} of them garbage" if recorder.writer.garbage else ""
+    lost, found = sum(recorder.file.gaps.lost().values()), recorder.file.garbage
+    garbage = f", {found} of them garbage" if found else ""
     return (f"recorded {recorder.messages} messages in {recorder.path}{garbage}, "
             f"{lost or 'none'} lost")
 

@@ -54,9 +54,10 @@ class Recorder(RunListener):
         credentials: returns the recorder's credentials on the bus of a run, for other hosts.
 
     Attributes:
-        writer: of the file; None before the run answers.
+        file: writer of the file, after `begin`.
     """
 
+    file: BagWriter
     which: ClassVar[str] = RECORDERS[0]
 
     def __init__(self, port: int, path: Path, *, overwrite: bool = False,
@@ -64,7 +65,6 @@ class Recorder(RunListener):
                  credentials: Callable[[RunInfo], Credentials | None] = lambda _run: None
                  ) -> None:
         super().__init__(port, path, launcher)
-        self.writer: BagWriter | None = None
         self._overwrite = overwrite
         self._from_start = launcher is not None
         self._credentials = credentials
@@ -72,46 +72,46 @@ class Recorder(RunListener):
 
     @property
     def messages(self) -> int:
-        """See `RunListener`."""
-        return self.writer.messages if self.writer else 0
+        """See `RunWriter`."""
+        return self.file.messages
 
-    def begin(self, info: RunInfo, frames: list[bytes]) -> None:
+    def begin(self, info: RunInfo, frames: list[bytes]) -> Recorder:
         """See `RunListener`."""
         begun_s = min((frame[0] for frame in _parsed(frames)), default=time.monotonic())
         self._origin_s, self._rate = info.origin_s, info.rate
         begin_s = (begun_s - info.origin_s) * info.rate
         documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                             nodes=tuple(info.nodes), started=_wall())
-        self._file = self.writer = BagWriter(
+        self.file = BagWriter(
             open_target(self.path, overwrite=self._overwrite), documents, begin_s=begin_s,
             time_zero_s=min(0.0, float(math.floor(begin_s))),
             views=documents.known.views(), from_start=self._from_start)
         if info.hosts:
             self._other_hosts = _OtherHosts(info.endpoints, self._credentials(info), begun_s)
+        return self
 
     def write(self, frames: list[bytes], turn_s: float) -> None:
-        """See `RunListener`."""
+        """See `RunWriter`."""
         parsed = _parsed(frames)
         if self._other_hosts is not None:
             parsed = self._other_hosts.joined(parsed, turn_s)
         for at_s, key, payload in sorted(parsed, key=itemgetter(0)):
-            self._file.take((at_s - self._origin_s) * self._rate, key, payload)
+            self.file.take((at_s - self._origin_s) * self._rate, key, payload)
 
     def flush(self) -> None:
-        """See `RunListener`."""
-        self._file.flush()
+        """See `RunWriter`."""
+        self.file.flush()
 
     def end(self, why: str, *, is_cut_off: bool) -> None:
-        """See `RunListener`."""
+        """See `RunWriter`."""
         del is_cut_off
-        self._file.close({"ended": why, "stopped": _wall()})
+        self.file.close({"ended": why, "stopped": _wall()})
 
     def abandon(self) -> None:
-        """See `RunListener`."""
+        """See `RunWriter`."""
         if self._other_hosts is not None:
             self._other_hosts.close()
-        if self.writer is not None:
-            self.writer.abandon()
+        self.file.abandon()
 
 
 def _parsed(frames: list[bytes]) -> list[Frame]:

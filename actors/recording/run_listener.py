@@ -15,7 +15,7 @@ import signal
 import socket
 import time
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.run_info import RunInfo, ask
@@ -39,6 +39,31 @@ _ASK_S = 0.2
 _WAITING_FRAMES = 500_000
 
 
+class RunWriter(Protocol):
+    """Writes what the processes of a run hand over."""
+
+    @property
+    def messages(self) -> int:
+        """Number of messages so far."""
+
+    def write(self, frames: list[bytes], turn_s: float) -> None:
+        """Write what was handed over.
+
+        Args:
+            frames: see `recorder_connection`.
+            turn_s: monotonic seconds before they were taken; infinity for the last time.
+        """
+
+    def flush(self) -> None:
+        """Hand everything to the kernel or the disk."""
+
+    def end(self, why: str, *, is_cut_off: bool) -> None:
+        """Write the end, for a reason; `is_cut_off` if the launcher has died without a signal."""
+
+    def abandon(self) -> None:
+        """Close all files as they are. Harmless when repeated."""
+
+
 class RunListener:
     """Base class of recorders. Call `open`, then `run`, once.
 
@@ -51,6 +76,9 @@ class RunListener:
         port: base port of the run.
         path: where it writes.
         launcher: pid of the launcher of a run that is about to start; None joins a running one.
+
+    Attributes:
+        writer: of the run; None before it answers.
     """
 
     which: ClassVar[str]
@@ -64,44 +92,19 @@ class RunListener:
         self._listener: socket.socket | None = None
         self._sockets = selectors.DefaultSelector()
         self._buffer = bytearray(recorder_connection.MAX_FRAME_BYTES)
-        self._info: RunInfo | None = None
+        self.writer: RunWriter | None = None
+        self._wait_s = PERIOD_S
         self._frames: list[bytes] = []
         self._next_ask_s = 0.0
         self._next_flush_s = 0.0
 
-    def begin(self, info: RunInfo, frames: list[bytes]) -> None:
-        """Begin to write as soon as the run answers.
+    def begin(self, info: RunInfo, frames: list[bytes]) -> RunWriter:
+        """Return the writer as soon as the run answers.
 
         Args:
             info: of the run.
-            frames: received so far; `write` gets them next.
+            frames: received so far; the writer gets them next.
         """
-        raise NotImplementedError
-
-    def write(self, frames: list[bytes], turn_s: float) -> None:
-        """Write what was handed over.
-
-        Args:
-            frames: see `recorder_connection`.
-            turn_s: monotonic seconds before they were taken; infinity for the last time.
-        """
-        raise NotImplementedError
-
-    def flush(self) -> None:
-        """Hand everything to the kernel or the disk."""
-        raise NotImplementedError
-
-    def end(self, why: str, *, is_cut_off: bool) -> None:
-        """Write the end, for a reason; `is_cut_off` if the launcher has died without a signal."""
-        raise NotImplementedError
-
-    def abandon(self) -> None:
-        """Close all files as they are. Harmless when repeated, and before `begin`."""
-        raise NotImplementedError
-
-    @property
-    def messages(self) -> int:
-        """Number of messages so far."""
         raise NotImplementedError
 
     def open(self) -> None:
@@ -143,7 +146,7 @@ class RunListener:
                         why, over = _RUN_ENDED, True
                         break
                     poller.register(pidfd, select.POLLIN)
-                ready = {fd for fd, _ in poller.poll(1000 * self._wait_s())}
+                ready = {fd for fd, _ in poller.poll(1000 * self._wait_s)}
                 if pidfd in ready:
                     why, over = _RUN_ENDED, True
                 elif stop in ready:
@@ -153,8 +156,9 @@ class RunListener:
                 self._turn()
             self._finish(why, run_is_over=over)
         except OSError as error:
+            count = self.writer.messages if self.writer else 0
             raise BagError(f"{self.path}: {error.strerror or error}: the recording ends after "
-                           f"{self.messages} messages, the robot goes on") from None
+                           f"{count} messages, the robot goes on") from None
         finally:
             if pidfd >= 0:
                 os.close(pidfd)
@@ -169,39 +173,36 @@ class RunListener:
         for key in list(self._sockets.get_map().values()):
             self._drop(key.fileobj)  # type: ignore[arg-type]
         self._sockets.close()
-        self.abandon()
+        if self.writer is not None:
+            self.writer.abandon()
 
     # -- one turn -------------------------------------------------------------------------------
 
     def _turn(self, *, is_last: bool = False) -> None:
         turn_s = time.monotonic()
         self._gather()
-        if self._info is None and turn_s >= self._next_ask_s:
+        if self.writer is None and turn_s >= self._next_ask_s:
             self._next_ask_s = turn_s + _ASK_S
             info = ask(self._port)
             if info is not None and self._launcher in {None, info.pid}:
-                self.begin(info, self._frames)
-                self._info, self._launcher = info, info.pid
-        if self._info is None:
+                self.writer, self._launcher = self.begin(info, self._frames), info.pid
+                self._wait_s = min(self.period_s, 0.4 / info.rate)  # sockets fill sooner then
+        if self.writer is None:
             return
         frames, self._frames = self._frames, []
-        self.write(frames, math.inf if is_last else turn_s)
+        self.writer.write(frames, math.inf if is_last else turn_s)
         if turn_s >= self._next_flush_s:
             self._next_flush_s = turn_s + self.flush_s
-            self.flush()
+            self.writer.flush()
 
     def _finish(self, why: str, *, run_is_over: bool) -> None:
         deadline = time.monotonic() + LAST_S
         while run_is_over and self._sockets.get_map() and time.monotonic() < deadline:
-            time.sleep(self._wait_s())
+            time.sleep(self._wait_s)
             self._turn()
         self._turn(is_last=True)
-        if self._info is not None:
-            self.end(why, is_cut_off=run_is_over)
-
-    def _wait_s(self) -> float:
-        """Return the time to sleep; at a high rate sockets fill sooner."""
-        return min(self.period_s, 0.4 / self._info.rate) if self._info else PERIOD_S
+        if self.writer is not None:
+            self.writer.end(why, is_cut_off=run_is_over)
 
     def _gather(self) -> None:
         """Take the frames that were handed over since the last call."""

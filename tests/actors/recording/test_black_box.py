@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import psutil
 import pytest
 
 from rampart.actors.bus.envelope import Header, encode
-from rampart.actors.bus.recorder_connection import RecorderConnection, frame
+from rampart.actors.bus.recorder_connection import frame
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.recording import incidents, ring
@@ -59,7 +60,7 @@ class Box:
                                      wall=lambda: self.now)
 
     def take(self, *message):
-        self.writer.take(frame(*message))
+        self.writer.write([frame(*message)])
 
     def second(self, at_s, *messages, poses=20):
         self.now += 1
@@ -124,7 +125,7 @@ def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):
     box.seconds(0, 20)
     box.second(20.0, decision(1, 20.5, active=()))
     box.seconds(21, 60)
-    box.writer.close()
+    box.writer.end()
     assert incidents_in(box.folder) == []
     assert not list(box.folder.glob("*/"))
 
@@ -149,7 +150,7 @@ def test_decisions_in_a_row_are_bounded_in_length_and_size(tmp_path):
     for at_s in range(0, 1000, 5):
         box.second(float(at_s), decision(at_s + 1, at_s + 0.5), poses=200)
         most = max(most, size(box.folder))
-    box.writer.close()
+    box.writer.end()
     spans = [(i.from_s, i.to_s) for i, _ in incidents_in(box.folder)]
     assert 3 <= len(spans) < 30
     assert all(to_s - from_s <= 36 for from_s, to_s in spans)
@@ -188,7 +189,7 @@ def test_after_a_kill_of_everything_the_last_second_is_readable(tmp_path):
 
 def test_an_incident_that_the_death_of_the_launcher_cuts_off_is_marked(box):
     box.second(30.0, decision(1, 30.5))
-    box.writer.close(is_cut_off=True)
+    box.writer.end(is_cut_off=True)
     assert [(i.at_s, i.partial) for i, _ in box.kept] == [(30.5, "the run was cut off")]
 
 
@@ -246,8 +247,8 @@ def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path, monkeypatch):
     monkeypatch.setattr("rampart.actors.recording.black_box._LOCK_S", 0.2)
     with pytest.raises(BagError, match="another black box"):
         Box(tmp_path, run="other", again=True)
-    one.writer.close()
-    other.writer.close()
+    one.writer.end()
+    other.writer.end()
 
 
 def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
@@ -279,7 +280,7 @@ def test_a_flood_of_garbage_on_watched_keys_begins_nothing(box):
         box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
         box.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
     box.second(1.0)
-    box.writer.close()
+    box.writer.end()
     assert incidents_in(box.folder) == []
 
 
@@ -303,93 +304,38 @@ def boxes():
     return found
 
 
-class Launcher:
-    """A run of one node with a black box."""
-
-    def __init__(self, folder):
-        self.port = free_base_port()
-        self.folder = folder
-        self.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-        self.box = RecorderProcess(Order(self.port, str(folder), self.process.pid,
-                                         black_box=LIMITS))
-
-    def end(self):
-        self.box.end()
-        self.process.kill()
-        self.process.wait()
-        self.process.stdin.close()
-
-
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    monkeypatch.setattr("rampart.actors.recording.process._NICE", 0)
-    made = Launcher(tmp_path / "paper")
-    origin_s = time.monotonic()
-    made.connection = RecorderConnection(made.port)
-    made.sent = 0
+def launcher(tmp_path):
+    """A black box of a process that stands for a launcher; it has no run."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
 
-    def send(*messages):
-        made.sent += 1
-        made.connection.take(*pose(made.sent, time.monotonic() - origin_s)[1:])
-        for message in messages:
-            made.connection.take(*message[1:])
+    def box(folder):
+        return RecorderProcess(Order(free_base_port(), str(folder), process.pid, black_box=LIMITS))
 
-    made.send = send
-    with AnsweringLauncher(made.port, origin_s, made.process.pid):
-        made.box.start()
-        yield made
-        made.end()
-        made.connection.close()
+    yield box
+    with process:
+        process.kill()
 
 
-def kept(run):
-    return [i for i, path in incidents_in(run.folder)]
-
-
-def recorded(run, incident):
-    path = run.folder / f"{incident.name}.mcap"
-    incidents.write_recording(run.folder / "sample", incident, path)
-    return Summary(BagReader(path))
-
-
-def test_a_killed_black_box_is_started_again_to_continue_its_ring(tmp_path, monkeypatch):
+def test_a_killed_black_box_is_started_again_to_continue_its_ring(launcher, tmp_path, monkeypatch):
     monkeypatch.setattr("rampart.actors.recording.process._AGAIN_S", 0.0)
-    launcher = Launcher(tmp_path / "paper")
-    launcher.box.start()
+    box = launcher(tmp_path / "paper")
+    box.start()
     [killed] = boxes()
     os.kill(killed, signal.SIGKILL)
-    wait_until(lambda: launcher.box.keep_alive() == "" and boxes() not in ([], [killed]))
+    wait_until(lambda: box.keep_alive() == "" and boxes() not in ([], [killed]))
     [back] = boxes()
     order = Path(f"/proc/{back}/cmdline").read_bytes().split(b"\0")[-2]
     assert msgspec.json.decode(order, type=Order).again
     os.kill(back, signal.SIGTERM)  # before it has a handler
-    launcher.end()
+    box.end()
 
 
-def test_a_recording_and_a_black_box_run_side_by_side(run, tmp_path):
-    recorder = RecorderProcess(Order(run.port, str(tmp_path / "run.mcap"), run.process.pid))
-    recorder.start()
-    wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
-               30, "the black box does not begin")
-    run.send(decision(1, 0.1), crash(0.2))
-    recorder.end()
-    run.send()
-    run.box.end()
-    assert recorder.problem() == run.box.problem() == ""
-    assert Summary(BagReader(tmp_path / "run.mcap")).keys[ftm_topics.DECISION.at()] == 1
-    [incident] = kept(run)
-    found = recorded(run, incident)
-    assert found.keys[ftm_topics.DECISION.at()] == 1
-
-
-def test_a_folder_that_cannot_be_made_ends_it_with_one_line(run, tmp_path):
-    run.box.end()
+def test_a_folder_that_cannot_be_made_ends_it_with_one_line(launcher, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    run.box = RecorderProcess(Order(run.port, str(tmp_path / "file" / "paper"), run.process.pid,
-                                    black_box=LIMITS))
-    run.box.start()
-    wait_until(run.box.keep_alive, 30, "it does not end")
-    problem = run.box.keep_alive()
-    assert "Not a directory" in problem
-    assert "\n" not in problem
-    run.send()  # the robot is undisturbed
+    box = launcher(tmp_path / "file" / "paper")
+    with AnsweringLauncher(box._order.port, time.monotonic(), box._order.launcher):
+        box.start()
+        wait_until(box.keep_alive, 30, "it does not end")
+    assert re.fullmatch(r"[^\n]*Not a directory[^\n]*", box.keep_alive())
+    box.end()

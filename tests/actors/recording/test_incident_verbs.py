@@ -103,7 +103,7 @@ def test_without_incidents_the_verbs_are_clear(home, capsys):
 
 
 def test_the_history_is_listed_and_cleared(box, capsys):
-    box.writer.close()
+    box.writer.end()
     text = printed(capsys, "history")
     assert "supervisor" in text
     assert "crashed" in text
@@ -130,7 +130,8 @@ def test_incidents_of_a_folder_that_cannot_be_written_are_still_readable(box, ca
 @pytest.mark.alone
 def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
         home, tmp_path, capsys):
-    with RealRun(tmp_path, "osmosis", "--mission", "A", "--black-box") as run:
+    beside = tmp_path / "beside.mcap"  # a recording of the same run
+    with RealRun(tmp_path, "osmosis", "--mission", "A", "--black-box", "--record", beside) as run:
         run.sleep_until(3.0)
         run.kill("localization")
         run.sleep_until(7.0)
@@ -147,6 +148,8 @@ def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
     assert "DM7" in {name.partition("/")[2] for name in (
         channel.topic for channel in summary.reader.channels.values())}
     assert "respawned by RM4" in printed(capsys, "show")
+    assert {"rampart/supervisor/event", "rampart/localization/pose"} <= set(
+        Summary(BagReader(beside)).keys)
 
 
 @pytest.mark.parametrize(("arguments", "has_one"), [
