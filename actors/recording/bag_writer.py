@@ -25,8 +25,7 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
-from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.message_form import Forms, Recorded
+from rampart.actors.recording.message_form import Forms, Recorded, plain_schema
 from rampart.actors.recording.run_documents import Documents
 from rampart.actors.recording.views import View, Views, encode
 from rampart.actors.system.topics import find_topic, own_topics

@@ -29,7 +29,6 @@ from rampart.actors.foreign.program import log_folder, make_log_folder
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, RecoveryReport
 from rampart.actors.ros2.diagnostics import Diagnostics
-from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.links import (
     ActionCall,
     Publication,
@@ -48,7 +47,7 @@ from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mapping import Inward, Outward, topic_of
 from rampart.actors.ros2.translation.tables import ROUTER, Ros2Link, read_links
 from rampart.actors.ros2.translation.types import Distribution, Types
-from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos
+from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos, RosGraph, misfits
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import Named, named
 from rampart.manager.spec.schema import SystemSpec

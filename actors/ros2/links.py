@@ -15,13 +15,12 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos as BusQos
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ros2.graph import RosGraph
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import RosClock
 from rampart.actors.ros2.translation.mapping import Inward, Outward, message_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.actors.ros2.wire import UNKNOWN_GID, Attachment, Qos
+from rampart.actors.ros2.wire import UNKNOWN_GID, Attachment, Qos, RosGraph
 from rampart.actors.runtime.clock import Clock
 
 SILENT_S = 1.0

@@ -16,10 +16,9 @@ from typing import Annotated, Any, ClassVar, cast
 import msgspec
 
 from rampart.actors.bus.bus import Bus
-from rampart.actors.ros2.bus_side import BusSide, WatchedBus
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
-from rampart.actors.ros2.side import Mode, Side, Tls, ZenohSide
+from rampart.actors.ros2.side import BusSide, Mode, Side, Tls, WatchedBus, ZenohSide
 from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import Attachment, Qos

@@ -21,7 +21,7 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
-from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.message_form import plain_schema
 from rampart.actors.recording.run_documents import known_of
 from rampart.actors.recording.views import encode
 from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals

@@ -19,7 +19,6 @@ from typing import Any
 import msgspec
 
 from rampart.actors.ros2.gateway import Gateway, types_of
-from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_nodes import RosNodes
 from rampart.actors.ros2.side import Tls, ZenohSide
@@ -30,8 +29,10 @@ from rampart.actors.ros2.wire import (
     Endpoint,
     EndpointKind,
     Qos,
+    RosGraph,
     data_key,
     dds_name,
+    misfits,
 )
 from rampart.actors.system.members import load_member
 from rampart.cli import systems

@@ -9,12 +9,19 @@ from typing import Any
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.translation.forms import READY
 from rampart.actors.ros2.translation.mapping import Inward, topic_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos, gid_of
+from rampart.actors.ros2.wire import (
+    Attachment,
+    Endpoint,
+    EndpointKind,
+    Qos,
+    RosGraph,
+    gid_of,
+    misfits,
+)
 from tests.fuzz.target import target
 
 _TYPES = (*sorted(READY), "nav_msgs/msg/OccupancyGrid", "diagnostic_msgs/msg/DiagnosticArray",

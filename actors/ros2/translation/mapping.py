@@ -9,13 +9,14 @@ import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Annotated, Any, Protocol, get_args
+from typing import Annotated, Any, get_args
 
 import msgspec
 import numpy as np
 from rosbags.interfaces import Nodetype
 
 from rampart.actors.bus.bounds import MOST, Count, Floats32, Meta, Text, Whole, clip
+from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, reader, steps
@@ -172,14 +173,6 @@ NS = 1_000_000_000
 _HEADER = "std_msgs/msg/Header"
 _F32 = "_f32"
 BESIDE = "beside."
-
-
-class HasSource(Protocol):
-    """The header of a message of the system."""
-
-    @property
-    def source(self) -> str:
-        """Node that has published the message."""
 
 
 class Inward:
@@ -345,7 +338,7 @@ class Outward:
                         for where, one in said.items()]
 
     def _read(self, where: str, said: str | float | bool, fields: TypeFields
-              ) -> Callable[[Any, HasSource | None], Any]:
+              ) -> Callable[[Any, Header | None], Any]:
         if not isinstance(said, str):
             return lambda _message, _header: said
         if said == "@source":
@@ -360,7 +353,7 @@ class Outward:
             return lambda message, _header: np.frombuffer(read(message), "<f4")
         return lambda message, _header: write(read(message))
 
-    def __call__(self, message: Any, stamp_ns: int, header: HasSource | None = None) -> bytes:
+    def __call__(self, message: Any, stamp_ns: int, header: Header | None = None) -> bytes:
         """Return the encoded message of ROS 2.
 
         Args:

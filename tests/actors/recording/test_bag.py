@@ -29,8 +29,7 @@ from rampart.actors.recording.bag_writer import (
     check_target,
     open_target,
 )
-from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.message_form import Forms
+from rampart.actors.recording.message_form import Forms, plain_schema
 from rampart.actors.recording.recorder import VirtualRecording
 from rampart.actors.recording.run_documents import collect, restore
 from rampart.cli.main import main

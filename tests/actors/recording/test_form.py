@@ -19,12 +19,12 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import (
     Forms,
     MessageForm,
     Recorded,
     header_of,
+    plain_schema,
 )
 
 form_of = Forms(topics.ALL).of

@@ -8,18 +8,20 @@ import time
 import msgspec
 import pytest
 
-from rampart.actors.ros2.graph import MOST, RosGraph, misfits
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import ZenohSide, recorded_key
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import (
+    MOST_TOKENS,
     Attachment,
     Endpoint,
     EndpointKind,
     Qos,
+    RosGraph,
     data_key,
     dds_name,
     gid_of,
+    misfits,
     ros_name,
 )
 
@@ -116,11 +118,11 @@ def test_the_graph_is_bounded_and_forgets_who_has_gone():
     assert graph.changed(CAPTURED, True) is None
     assert graph.changed(CAPTURED, False) is not None
     assert graph.changed(CAPTURED, False) is None
-    for number in range(MOST):
+    for number in range(MOST_TOKENS):
         graph.changed(f"@ros2_lv/0/a/{number}/{number}/NN/%/%/n", True)
     with pytest.raises(ValueError, match="more than"):
         graph.changed(CAPTURED, True)
-    assert graph.nodes() == {"/n": MOST}
+    assert graph.nodes() == {"/n": MOST_TOKENS}
 
 
 async def test_what_a_node_says_and_hears_is_handed_to_the_recorder_as_it_travelled():
