@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
 from rampart import systems
+from rampart.actors.bus.topics import DIAGNOSTIC
+from rampart.actors.detection.stub import StubDetection
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics
+from rampart.actors.recovery.stub import StubRecovery
+from rampart.actors.runtime.actor import Context
+from rampart.manager.actor import FtmManager
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_state import (
     Command,
@@ -20,6 +29,8 @@ from rampart.manager.arbitration.arbiter_state import (
 from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.specification import SystemSpec, parse_specification
+from rampart.testing import VirtualSystem
+from tests.osmosis_system import run_context
 
 PAPER, FULL = ((systems.SHIPPED / name).read_text(encoding="utf-8")
                for name in ("paper.toml", "osmosis.toml"))
@@ -145,3 +156,49 @@ class Bench:
 
 def commands(outputs: list) -> list[tuple[str, bool]]:
     return [(o.recovery, o.activate) for o in outputs if isinstance(o, Command)]
+
+
+class Managed(VirtualSystem):
+    """The running manager between modules that do what they are told, and all that it says."""
+
+    def __init__(self, spec: SystemSpec | None = None,
+                 manager: Callable[[Context], FtmManager] = FtmManager, **known: Any) -> None:
+        super().__init__(run_context(system=spec or paper(), **known))
+        self._manager = manager
+        self.decisions, self.respawns, self.problems, self.statuses = map(self.hear, (
+            topics.DECISION, topics.RESPAWN, DIAGNOSTIC, topics.MANAGER_STATUS))
+
+    async def __aenter__(self) -> Self:
+        """Start everything, and wait until all is known and well."""
+        await super().__aenter__()
+        self.start_manager()
+        for detection in self.run.system.detections:
+            self.start(detection.name, StubDetection)
+        for recovery in self.run.system.recoveries:
+            self.start(recovery.name, StubRecovery, takes_s=0.02,
+                       ends="done" if recovery.kind.repairs else "degraded")
+        await asyncio.sleep(1.0)
+        return self
+
+    def start_manager(self) -> None:
+        self.start("ftm_manager", self._manager)
+
+    def detect(self, *active: str) -> None:
+        """Have exactly these detection modules be active."""
+        for detection in self.run.system.detections:
+            self.say(topics.STUB_TRIGGER, fm.StubTrigger(
+                detection.name, detection.name in active, "played"))
+
+    async def reset(self, recovery: str) -> None:
+        self.say(topics.RESET, fm.Reset(recovery, "operator"))
+        await self.settle()
+
+    @property
+    def status(self) -> fm.ManagerStatus:
+        """What the manager said last."""
+        return self.statuses[-1].message
+
+    @property
+    def taken(self) -> list[tuple[tuple[str, ...], int, tuple[str, ...]]]:
+        """Active mechanisms, rule and recoveries of each decision."""
+        return [(d.message.active, d.message.rule, d.message.recoveries) for d in self.decisions]

@@ -9,10 +9,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
-from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.recovery.stub import StubRecovery
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.supervision.node_process import OF_A_PART
@@ -25,9 +22,8 @@ from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.clearing import reset_role
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
-from rampart.testing import VirtualSystem, run
-from tests.manager.bench import PAPER, RMS, Bench, edited, full_system
-from tests.osmosis_system import run_context
+from rampart.testing import run
+from tests.manager.bench import PAPER, RMS, Bench, Managed, edited, full_system
 
 
 def bench(**fields) -> Bench:
@@ -162,10 +158,6 @@ def full_with(name: str, clears: Clears):
         replace(m, clears=clears) if m.name == name else m for m in full_system().mechanisms))
 
 
-def detect(system: VirtualSystem, name: str, *, active: bool) -> None:
-    system.say(ftm_topics.STUB_TRIGGER, fm.StubTrigger(name, active, "played"))
-
-
 @pytest.mark.parametrize("clears", [Clears.BY_OPERATOR, Clears.NEVER])
 def test_a_resumed_run_has_not_cleared(tmp_path, clears):
     """Its nodes have higher incarnations of the same checkpoints; its time is another one."""
@@ -176,21 +168,13 @@ def test_a_resumed_run_has_not_cleared(tmp_path, clears):
             return FtmManager(dataclasses.replace(context, checkpoints=FileCheckpoints(
                 tmp_path, "ftm_manager", "run", number * OF_A_PART + context.incarnation)))
 
-        async with VirtualSystem(run_context(system=spec)) as system:
-            statuses = system.hear(ftm_topics.MANAGER_STATUS)
-            system.start("ftm_manager", manager)
-            for detection in spec.detections:
-                system.start(detection.name, StubDetection)
-            for recovery in spec.recoveries:
-                system.start(recovery.name, StubRecovery, takes_s=0.02, ends="done")
-            await asyncio.sleep(0.5)
-            for detection in spec.detections:
-                detect(system, detection.name, active=detection.name == error)
+        async with Managed(spec, manager) as system:
+            system.detect(error)
             await asyncio.sleep(2.0)
             if reset:
-                system.say(ftm_topics.RESET, fm.Reset("RM8", "operator"))
+                await system.reset("RM8")
                 await asyncio.sleep(1.0)
-            return statuses[-1].message
+            return system.status
 
     assert run(lambda: part(0)).latched == ()
     assert run(lambda: part(1, "DM13")).latched == ("RM8",)
