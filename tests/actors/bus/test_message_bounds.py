@@ -5,20 +5,20 @@ from __future__ import annotations
 import asyncio
 import math
 
-import msgspec
 import pytest
 from msgspec import inspect
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, clip, oversized
-from rampart.actors.bus.envelope import ArrivalGuard, decode
+from rampart.actors.bus.envelope import ArrivalGuard
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, on
-from rampart.testing import VirtualSystem, run
+from rampart.testing import VirtualSystem
 from tests.fuzz.message_extremes import HEADER, all_topics, edges, pack, smallest, unbounded
+from tests.virtual_time import within
 
 NOW_S = 2e12
 """Later than any stamp, so that none is ahead."""
@@ -71,79 +71,43 @@ def test_a_payload_that_is_too_long_is_refused():
     assert f"{MAX_PAYLOAD_BYTES + 1} bytes" in reason
 
 
-class Reader(Actor):
-    """Keeps the messages of one topic."""
-
-    heard: list = []
-
-    @on(ftm_topics.STUB_TRIGGER)
-    def take(self, message, _header):
-        self.heard.append(message)
-
-
-class Writer(Actor):
-    """Publishes what no reader would take."""
+class Node(Actor):
+    """Publishes and reports what no reader would take, and keeps what it hears."""
 
     outputs = (topics.MISSION_STATUS,)
 
     def on_start(self):
+        self.heard = []
+        light = m.LightMeasurement("x" * 256, 0.0, 0.0, m.LightVerdict.OK)
         self.publish(topics.MISSION_STATUS, m.MissionStatus(
-            "", "", m.MissionPhase.IDLE, 0, (), (),
-            tuple(m.LightMeasurement("x" * 256, 0.0, 0.0, m.LightVerdict.OK)
-                  for _ in range(9999)), ""))
+            "", "", m.MissionPhase.IDLE, 0, (), (), (light,) * 9999, ""))
+        self.report_diagnostic("c" * 5000, "r" * 5000 + "\udc80", "o" * 5000)
+
+    @on(ftm_topics.STUB_TRIGGER)
+    def take(self, message, _header):
+        self.heard.append(message.name)
 
 
-def lived(kind, during=lambda _hub: None):
-    """Return what an actor that lived for a second has published: key, body."""
-
-    async def scenario():
-        async with VirtualSystem() as system:
-            sent = system.overhear("node")
-            system.start("node", kind)
-            await asyncio.sleep(0.1)
-            during(system.bus)
-            await asyncio.sleep(1.0)
-            await system.stop("node")
-            posted = system.hub.postings.get(bus_topics.HEARTBEAT.at("node"))
-            assert posted is not None
-            beat = msgspec.to_builtins(decode(bus_topics.HEARTBEAT, posted)[1])
-            return [*sent, ("heartbeat/node", beat)]
-
-    return run(scenario)
-
-
-def test_a_message_beyond_a_bound_is_reported_counted_and_never_handled():
-    Reader.heard = []
-    key = ftm_topics.STUB_TRIGGER.at()
-
-    def during(stranger):
-        body = {"name": "n" * 257, "active": True, "reason": ""}
-        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 1, 0.0, body))
-        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 2, 0.0, {**body, "name": "n"}))
-
-    sent = lived(Reader, during)
-    assert [message.name for message in Reader.heard] == ["n"]
-    report = next(body for k, body in sent if k == "diagnostic/node")
-    assert (report["context"], report["offender"]) == ("payload rejected", key)
-    assert report["reason"] == "not a StubTrigger: Expected `str` of length <= 256 - at `$[4].name`"
-    beats = [body for k, body in sent if k == "heartbeat/node"]
-    assert beats[-1]["rejected_payloads"] == 1
-
-
-def test_a_message_too_long_for_readers_is_reported_and_not_sent():
-    sent = lived(Writer)
-    assert not [key for key, _ in sent if key == topics.MISSION_STATUS.at()]
-    report = next(body for key, body in sent if key == "diagnostic/node")
-    assert (report["context"], report["offender"]) == ("not sent", topics.MISSION_STATUS.at())
-
-
-def test_a_long_or_broken_text_is_shortened_where_it_is_reported():
-    class Talker(Actor):
-        def on_start(self):
-            self.report_diagnostic("c" * 5000, "r" * 5000 + "\udc80", "o" * 5000)
-
-    body = next(body for key, body in lived(Talker) if key == "diagnostic/node")
-    assert [len(body[name]) for name in ("context", "reason", "offender")] == [TEXT_CHARS] * 3
+@within(VirtualSystem)
+async def test_what_is_beyond_a_bound_is_reported_and_neither_sent_nor_handled(system):
+    told, beats = (system.hear(topic, "node") for topic in (
+        bus_topics.DIAGNOSTIC, bus_topics.HEARTBEAT))
+    sent, key = system.hear(topics.MISSION_STATUS), ftm_topics.STUB_TRIGGER.at()
+    node = system.start("node", Node)
+    await asyncio.sleep(0.1)
+    for sequence, name in enumerate(("n" * 257, "n")):
+        system.bus.publish(ftm_topics.STUB_TRIGGER, key, pack(
+            "x", 1, sequence, 0.0, {"name": name, "active": True, "reason": ""}))
+    await asyncio.sleep(6.0)  # a heartbeat is posted, and sent now and then
+    assert (sent, node.heard) == ([], ["n"])
+    too_long, shortened, rejected = (one.message for one in told)
+    assert (too_long.context, too_long.offender) == ("not sent", topics.MISSION_STATUS.at())
+    assert [len(text) for text in (shortened.context, shortened.reason, shortened.offender)] == (
+        [TEXT_CHARS] * 3)
+    assert (rejected.context, rejected.offender) == ("payload rejected", key)
+    assert rejected.reason == (
+        "not a StubTrigger: Expected `str` of length <= 256 - at `$[4].name`")
+    assert beats[-1].message.rejected_payloads == 1
 
 
 @pytest.mark.parametrize(("text", "chars", "expected"), [
