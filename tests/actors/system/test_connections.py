@@ -201,17 +201,3 @@ def test_an_actor_of_the_wrong_kind(tank):
 def test_a_judge_that_cannot_judge(tank, said, line):
     more = f"[judge]\n{said or 'litres = 3'}"
     assert line_of(tank, JUDGE.format("LEVLE"), "Gauge", more=more).startswith(line)
-
-
-@pytest.mark.parametrize(("said", "line"), [
-    ("after_s = 0", "$.end.after_s = 0: expected a number > 0"),
-    ("after = 3", "$.end.after = 3: unknown field; known: after_s")])
-def test_an_end_that_is_none(tank, said, line):
-    assert line_of(tank, "", "Gauge", more=f"[end]\n{said}\n") == line
-
-
-@pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])
-def test_whole_systems_are_sound_with_mechanisms_and_without(name):
-    for ftm in (True, False):
-        plan = RunPlan(system_file=str(system_file(name)), ftm=ftm)
-        assert Layout(plan, load_system(plan)).members
