@@ -8,62 +8,32 @@ import json
 import pytest
 from msgspec.structs import replace
 
-from rampart.actors.ftm import messages as m
-from rampart.actors.ftm import topics
-from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.runtime.run_context import RunContext
 from rampart.cli.main import main
-from rampart.manager.actor import FtmManager
 from rampart.manager.analysis.pairs import Pair, causes_of, pairs
-from rampart.manager.spec.schema import SystemSpec
-from rampart.testing import VirtualSystem, run
+from rampart.testing import run
 from tests import ROOT
-from tests.manager.bench import full_system, paper
+from tests.manager.bench import Managed, full_system, paper
 
 SOON_S = 0.05
 
 
-class Played(VirtualSystem):
-    """The running manager of a system, with recoveries that succeed at once."""
-
-    def __init__(self, spec: SystemSpec) -> None:
-        super().__init__(RunContext(system=spec))
-        self.spec = spec
-        self.since: dict[str, float] = {}
-        self.commands = {r.name: self.hear(topics.RECOVERY_COMMAND, r.name)
-                         for r in spec.recoveries}
-
-    async def begin(self) -> None:
-        for recovery in self.spec.recoveries:
-            self.start(recovery.name, StubRecovery, takes_s=0.0,
-                       ends="done" if recovery.kind.repairs else "degraded")
-        self.start("ftm_manager", FtmManager)
-        await self.become()
-
-    async def become(self, *mechanisms: str) -> tuple[str, ...]:
-        """Make exactly these mechanisms active; return the recoveries that are in force then."""
-        active = {d for name in mechanisms for d in causes_of(self.spec, name)}
-        now_s = self.clock.now()
-        self.since = {name: self.since.get(name, now_s) for name in active}
-        for detection in self.spec.detections:
-            is_active = detection.name in active
-            state = m.DetectionState.ACTIVE if is_active else m.DetectionState.IDLE
-            self.say(topics.DETECTION, m.DetectionReport(
-                state, "told" if is_active else "", (), self.since.get(detection.name, now_s)),
-                detection.name)
-        await asyncio.sleep(SOON_S)
-        return tuple(name for name, heard in self.commands.items()
-                     if heard and heard[-1].message.activate)
+async def become(system: Managed, *mechanisms: str) -> tuple[str, ...]:
+    """Make exactly these mechanisms active; return the recoveries that are in force then."""
+    spec = system.run.system
+    system.detect(*(cause for name in mechanisms for cause in causes_of(spec, name)))
+    await asyncio.sleep(SOON_S)
+    return tuple(r.name for r in spec.recoveries if system.actors[r.name].activated)
 
 
-async def played(spec: SystemSpec, first: str, second: str) -> Pair:
+async def played(system: Managed, first: str, second: str) -> Pair:
     found = []
-    for remaining in ((second,), (first,)):
-        async with Played(spec) as system:
-            await system.begin()
-            await system.become(first)
-            both = await system.become(first, second)
-            found += [await system.become(*remaining), await system.become()]
+    for remaining in (second, first):
+        await become(system, first)
+        both = await become(system, first, second)
+        found += [await become(system, remaining), await become(system)]
+        for latched in system.status.latched:
+            await system.reset(latched)
+        assert await become(system) == ()
     return Pair(first, second, both, found[0], found[2], found[1])
 
 
@@ -76,8 +46,9 @@ def test_the_running_manager_does_what_the_table_lists_for_each_ordered_pair(sys
     assert len(table) == count * (count - 1)
 
     async def scenario() -> None:
-        for pair in table:
-            assert await played(spec, pair.first, pair.second) == pair
+        async with Managed(spec) as managed:
+            for pair in table:
+                assert await played(managed, pair.first, pair.second) == pair
 
     run(scenario)
 
