@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rampart.actors.bus.messages import Message
-from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.runtime.actor import Actor, every
-from rampart.actors.runtime.checkpoint import StateFormat
+from rampart import Actor, Message, Qos, StateFormat, Topic, every
 
 
 class Counted(Message, frozen=True):

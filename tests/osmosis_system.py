@@ -6,11 +6,9 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, TypeVar
 
-from rampart import systems
+from rampart import Actor, Application, systems
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.access import PagePlan

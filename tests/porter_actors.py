@@ -7,8 +7,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.messages import Message
-from rampart.actors.bus.topic import Qos, Topic
+from rampart import Message, Qos, Topic
 from rampart.actors.runtime.actor import Actor, Header, every, on
 from rampart.manager.spec.tables import Name, NonNegative
 from tests import ROOT

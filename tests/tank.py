@@ -7,8 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from rampart.actors.bus.messages import Message
-from rampart.actors.bus.topic import Qos, Topic
+from rampart import Message, Qos, Topic
 
 
 class Phase(StrEnum):

@@ -9,23 +9,15 @@ from typing import Any, Self
 
 import msgspec
 
-from rampart import systems
+from rampart import Command, Context, DecisionMade, RecoveryHeard, ResetAsked, Tick, systems
 from rampart.actors.bus.topics import DIAGNOSTIC
 from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.runtime.actor import Context
 from rampart.manager.actor import FtmManager
 from rampart.manager.arbitration.arbiter import build_arbiter
-from rampart.manager.arbitration.arbiter_state import (
-    Command,
-    DecisionMade,
-    RecoveryHeard,
-    ResetAnswered,
-    ResetAsked,
-    Tick,
-)
+from rampart.manager.arbitration.arbiter_state import ResetAnswered
 from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.specification import SystemSpec, parse_specification

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from msgspec import Meta
 
+from rampart import Actor, Message
 from rampart.actors.bus.fields import Field
-from rampart.actors.bus.messages import Message
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
-from rampart.actors.runtime.actor import Actor
 from rampart.testing import VirtualSystem
 from tests.tank import LEVEL, TOPICS, Level, Phase, Pump
 from tests.virtual_time import within

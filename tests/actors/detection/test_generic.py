@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from rampart import Actor, Context, DetectionState
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
@@ -26,13 +27,11 @@ from rampart.actors.detection.unchanged import Unchanged, UnchangedMonitor
 from rampart.actors.detection.watchdog import Watchdog, WatchdogCore
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.ftm.messages import DetectionState
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.machine.patience import Usage
 from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.tables import FAILOVER_S
 from rampart.testing import Ear, VirtualSystem, play, run, table

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from rampart import RunContext, parse_specification
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.ftm import messages as m
@@ -19,10 +20,8 @@ from rampart.actors.recovery.respawn_group import RespawnGroup
 from rampart.actors.recovery.telling import Call, Hold
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
-from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem, run
 from tests import CELL, TANK
 from tests.actors.osmosis.recovery.world import Boss, Node, Supervisor

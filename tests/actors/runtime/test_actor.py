@@ -14,22 +14,19 @@ from typing import ClassVar
 
 import pytest
 
+from rampart import DetectionModule, Message, Qos, RecoveryModule, Topic
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import ArrivalGuard, encode
-from rampart.actors.bus.messages import Message
-from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
-from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.declaration import Declared

@@ -9,19 +9,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from rampart import systems
+from rampart import Actor, Context, SystemSpec, parse_specification, systems
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.parameters import NodeNames, read_parameters
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import REPORTS_ON, load_class, load_member
 from rampart.cli import systems as cli_systems
-from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import NonNegative, SpecificationError
 from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import run

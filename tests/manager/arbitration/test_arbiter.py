@@ -9,16 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rampart import STRATEGIES, Arbiter, Command, RecoveryHeard, ResetAsked, Tick, build_arbiter
 from rampart.manager.actor import forgive_absence
-from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
-from rampart.manager.arbitration.arbiter_state import (
-    Command,
-    RecoveryHeard,
-    ResetAsked,
-    ShadowDiffered,
-    Tick,
-)
+from rampart.manager.arbitration.arbiter_state import ShadowDiffered
 from rampart.manager.arbitration.detection_track import (
     DetectionHeard,
     DetectionRules,
@@ -28,7 +22,6 @@ from rampart.manager.arbitration.detection_track import (
     pass_time,
 )
 from rampart.manager.model.mechanisms import RecoveryPhase
-from rampart.manager.strategies.registry import STRATEGIES
 from tests.manager.bench import DMS, RMS, Bench, commands, edited, paper
 
 ACTING, DONE, IDLE = RecoveryPhase.ACTING, RecoveryPhase.DONE, RecoveryPhase.IDLE

@@ -9,19 +9,15 @@ import math
 import pytest
 from msgspec.structs import replace
 
+from rampart import Arbiter, Context, SpecificationError, parse_specification, verify
 from rampart.actors.ftm import messages as fm
-from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
-from rampart.manager.analysis.verification import verify
-from rampart.manager.arbitration.arbiter import Arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.clearing import reset_role
-from rampart.manager.spec.specification import parse_specification
-from rampart.manager.spec.tables import SpecificationError
 from rampart.testing import run
 from tests.manager.bench import PAPER, RMS, Bench, Managed, edited, full_system
 

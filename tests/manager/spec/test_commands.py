@@ -6,14 +6,11 @@ import re
 
 import pytest
 
+from rampart import parse_specification
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
-from rampart.manager.spec.specification import (
-    SpecificationError,
-    check_change,
-    parse_specification,
-)
+from rampart.manager.spec.specification import SpecificationError, check_change
 from tests.tug import TUG, write_tug
 
 COMMAND_NODE = "rampart.actors.foreign.command_node:CommandNode"

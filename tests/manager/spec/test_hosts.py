@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from rampart import SpecificationError, parse_specification
 from rampart.actors.system.hosts import Hosts
 from rampart.manager.spec.budget import check
-from rampart.manager.spec.specification import parse_specification
-from rampart.manager.spec.tables import SpecificationError
 from tests.documents.page import Page
 from tests.two_hosts import two_hosts
 

@@ -2,11 +2,9 @@
 
 import pytest
 
+from rampart import parse_specification
 from rampart.manager.spec.schema import Kind
-from rampart.manager.spec.specification import (
-    SpecificationError,
-    parse_specification,
-)
+from rampart.manager.spec.specification import SpecificationError
 from tests import CELL
 from tests.manager.bench import PAPER, paper
 
