@@ -7,7 +7,6 @@ import json
 import tempfile
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,11 +14,10 @@ from mcap.writer import CompressionType, Writer
 from PIL import Image
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_airport, load_mission
-from rampart.actors.osmosis.airport.graph_format import allowed_area
+from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import AirportError
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
-from rampart.actors.recording.bag_writer import BagError, BagWriter
+from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.run_documents import recorded_system, restore
 from rampart.cli.record.record_verbs import described
@@ -28,18 +26,14 @@ from rampart.files.reading import FileError
 from rampart.manager.analysis.formula import formula_of
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
 from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
-from rampart.manager.spec.adaptation import Change, ChangeError, adapt, parse_value
-from rampart.manager.spec.specification import check_document, parse_specification, read_document
+from rampart.manager.spec.adaptation import ChangeError, parse_value
+from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
-from rampart.sim.campaign.job import Job, RunResult
-from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import CELL, ROOT, TANK
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
-from tests.actors.recording.samples import documents, pose
-from tests.fuzz.message_extremes import sample
 from tests.fuzz.target import target
 
 SYSTEMS = ROOT / "systems"
@@ -76,24 +70,6 @@ def airport_toml(data: bytes) -> None:
     load_airport(written("airport/field.toml", data))
 
 
-@target("mission-toml", refuses=(AirportError,), form="toml", one_line=True,
-        samples=lambda: [b'name = "M"\ngoals = [{ x_m = 4, y_m = 0, mode = "taxi" }]\n'])
-def mission_toml(data: bytes) -> None:
-    load_mission(written("mission.toml", data), _field())
-
-
-@target("mission-miss", refuses=(AirportError,), form="text", one_line=True,
-        words=("x=", "y=", "taxi=", ","),
-        samples=lambda: [b"x=9.5,y=0,taxi=1\n\nx=3,y=0.25,taxi=0\n"])
-def mission_miss(data: bytes) -> None:
-    load_mission(written("MISSION_A.miss", data), _field())
-
-
-@cache
-def _field() -> Any:
-    return load_airport(written("airport/field.toml", TOML.encode()))
-
-
 @target("graph", refuses=(AirportError,), form="json", one_line=True,
         samples=lambda: [json.dumps(GRAPH).encode(), json.dumps({
             "nodes": [*GRAPH["nodes"], {"id": "N3", "x": 5, "y": 4}],
@@ -102,13 +78,6 @@ def graph(data: bytes) -> None:
     if not (folder() / "foreign/field.png").exists():
         written("foreign/field.png", _image("PNG", size=480))
     load_airport(written("foreign/field.graph", data))
-
-
-@target("mask", refuses=(AirportError,), one_line=True,
-        samples=lambda: [_image("PNG"), _image("PNG", "P"), _image("PNG", "RGBA"),
-                         _image("JPEG")])
-def mask(data: bytes) -> None:
-    allowed_area(written("mask.png", data))
 
 
 def _image(form: str, mode: str = "RGB", size: int = 48) -> bytes:
@@ -141,33 +110,6 @@ def system(data: bytes) -> None:
     spec = parse_specification(data.decode(errors="replace"), "system.toml")
     formula_of(spec.build_fault_tree())
     write_open_psa(spec)
-
-
-@cache
-def _document() -> dict[str, Any]:
-    return read_document(_PAPER, "paper.toml")
-
-
-@target("adaptation", refuses=(ChangeError, SpecificationError, ValueError, RecursionError),
-        form="json", samples=lambda: [json.dumps(change).encode() for change in (
-            {"action": "disable", "name": "FTM7"},
-            {"action": "retune", "name": "RM3", "values": {"deadline_s": 2.5}},
-            {"action": "retune", "name": "DM1", "values": {"margin_m": 0.7}},
-            {"action": "retune", "name": "FTM2", "values": {"detect": "DM2 or DM6"}},
-            {"action": "replace", "name": "FTM7", "values": {
-                "detect": "DM7", "recover": "RM4", "event": "localization_crash"}},
-            {"action": "set", "name": "order", "values": {"value": ["safer"]}},
-            {"action": "set", "name": "strategy", "values": {"value": "guarded-repair"}})])
-def adaptation(data: bytes) -> None:
-    adapt(_document(), msgspec.json.decode(data, type=Change), "paper.toml")
-
-
-@target("system-json", refuses=(SpecificationError, ValueError, RecursionError), form="json",
-        samples=lambda: [msgspec.json.encode(read_document(text, "small.toml"))
-                                        for text in [TANK] * 9 + [_CELL]])
-def system_json(data: bytes) -> None:
-    """A changed system, as `manager/system` carries it."""
-    check_document(msgspec.json.decode(data, type=dict[str, Any]), "cell.toml")
 
 
 @target("value", refuses=(ChangeError,), form="text", one_line=True,
@@ -228,46 +170,30 @@ def fault(data: bytes) -> None:
 # -- recordings, results ---------------------------------------------------------------------------
 
 
-def recordings() -> list[bytes]:
-    """Return recordings, of ours and of others."""
-    made = [_foreign(kind) for kind in (
-        CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD)]
-    path = folder() / "own.mcap"
-    writer = BagWriter(path.open("wb"), msgspec.structs.replace(documents(), files=()))
-    for number in range(6):
-        writer.take(*pose(number + 1, number / 20))
-    writer.close()
-    return [*made, path.read_bytes()[:1 << 16]]
-
-
-def _foreign(compression: CompressionType) -> bytes:
+def recording() -> bytes:
+    """Return a recording of another program, with a run's description."""
     out = io.BytesIO()
-    writer = Writer(out, compression=compression, enable_crcs=False, use_statistics=False)
+    writer = Writer(out, compression=CompressionType.NONE, enable_crcs=False, use_statistics=False)
     writer.start("rampart", "fuzz")
     writer.add_metadata("rampart.run", {"title": "t", "time_zero_s": "-3", "nodes": '["a"]'})
     writer.add_attachment(0, 0, "system.toml", "application/toml",
                           b"[robot]\nlength_m = 1.0\nwidth_m = 0.5\n")
     schema = writer.register_schema("Pose", "jsonschema", b"{}")
     channel = writer.register_channel("pose", "json", schema, {"key": "rampart/localization/pose"})
-    for number in range(5):
-        writer.add_message(channel, number * 10**8, b'{"source":"l","incarnation":1,"sequence":1,'
-                           b'"stamp":1.0,"body":{"x_m":0,"y_m":0,"yaw_rad":0}}', number)
+    writer.add_message(channel, 0, b'{"source":"l","incarnation":1,"sequence":1,"stamp":1.0,'
+                       b'"body":{"x_m":0,"y_m":0,"yaw_rad":0}}', 0)
     writer.add_metadata("rampart.end", {"lost": '{"a": 1}', "ended": "over"})
     writer.finish()
     return out.getvalue()
 
 
-@target("mcap-info", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
-def mcap_info(data: bytes) -> None:
-    summary = Summary(BagReader(written("bag.mcap", data)))
+@target("mcap", refuses=(BagError,), one_line=True, samples=lambda: [recording()])
+def mcap(data: bytes) -> None:
+    reader = BagReader(written("bag.mcap", data))
+    summary = Summary(reader)
     msgspec.json.encode(described(summary))
     recorded_system(summary.files)
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
-
-
-@target("mcap-repair", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
-def mcap_repair(data: bytes) -> None:
-    reader = BagReader(written("torn.mcap", data))
     whole = folder() / "whole.mcap"
     copied = repair(reader, whole, overwrite=True)
     if Summary(BagReader(whole)).messages != copied:
@@ -294,12 +220,3 @@ def recorded_json(data: bytes) -> None:
     if refused is not None:
         raise refused
 
-
-@target("stored-run", refuses=_NO_RUN, form="msgpack", samples=lambda: [
-        msgspec.msgpack.encode([msgspec.to_builtins(sample(kind)) for kind in (Job, RunResult)])])
-def stored_run(data: bytes) -> None:
-    """A row of a campaign's store: a job and its result."""
-    job, result = msgspec.msgpack.decode(data, type=tuple[msgspec.Raw, msgspec.Raw])
-    run = _run(bytes(job), bytes(result))
-    run.job.text()
-    _ = run.job.key, run.result.margin

@@ -1,7 +1,7 @@
 """Hypothesis strategies for inputs of decoders: samples with a few changes.
 
 The changes know the formats: numbers become extreme, nesting deep, lines repeated. Documents
-change as trees. MCAP changes as chunks whose lengths are correct.
+change as trees.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,8 +23,6 @@ MAX_INPUT = 1 << 16
 
 Draw = Callable[[st.SearchStrategy[Any]], Any]
 Change = Callable[[Draw, bytes, bytes], bytes]
-Part = tuple[bytes, bytes]
-"""The kind of a chunk, and its content."""
 
 _NUMBERS = (0, -1, 1, 255, 256, 65536, 2**31, 2**32 - 1, 2**53 + 1, 2**63 - 1, 2**63, 2**64 - 1,
             -2**63, 0.0, -0.0, 0.5, 1e-9, 1e-320, 1e17, 1e300, math.nan, math.inf, -math.inf)
@@ -103,12 +100,8 @@ def _whole(form: str) -> Change:
             parts, others = _APART[form](data), _APART[form](other)
         except Exception:  # damaged by an earlier change
             return _piece(draw, data, other)
-        if form != "mcap":
-            parts = _tree(draw, parts, others)
-        elif parts and others:
-            parts = _chunk(draw, parts, others)
         try:
-            return _TOGETHER[form](parts)
+            return _TOGETHER[form](_tree(draw, parts, others))
         except Exception:  # the format has no such value
             return data
 
@@ -150,39 +143,10 @@ def _places(root: list[Any]) -> list[tuple[Any, Any]]:
     return found
 
 
-def _chunk(draw: Draw, parts: list[Part], others: list[Part]) -> list[Part]:
-    """Remove, repeat, move or change a chunk, or insert one of another input."""
-    at, kind, content = draw(st.sampled_from(
-        [(index, *part) for index, part in enumerate(parts)]))
-    other = draw(st.sampled_from(others))
-    changed = (kind, _piece(draw, content, other[1]))
-    parts[at:at + 1] = draw(st.sampled_from(
-        ([changed], [], [(kind, content)] * 4, [(kind, content)] * 200, [(kind, content), other])))
-    to = draw(st.integers(0, len(parts)))
-    return parts[to:] + parts[:to] if draw(st.integers(0, 9)) == 9 else parts
-
-
-_MCAP = b"\x89MCAP0\r\n"
-
-
-def _mcap_apart(data: bytes) -> list[Part]:
-    parts, at = [], len(_MCAP)
-    while at + 9 <= len(data) - len(_MCAP):
-        kind, length = struct.unpack_from("<cQ", data, at)
-        parts.append((kind, data[at + 9:at + 9 + length]))
-        at += 9 + length
-    return parts
-
-
-def _mcap_together(parts: list[Part]) -> bytes:
-    return _MCAP + b"".join(
-        kind + struct.pack("<Q", len(content)) + content for kind, content in parts) + _MCAP
-
-
 _APART: dict[str, Callable[[bytes], Any]] = {
     "json": json.loads, "toml": lambda data: toml.parse(data.decode()),
-    "msgpack": msgspec.msgpack.decode, "mcap": _mcap_apart}
+    "msgpack": msgspec.msgpack.decode}
 _TOGETHER: dict[str, Callable[[Any], bytes]] = {
     "json": lambda value: json.dumps(value).encode(),
     "toml": lambda value: tomli_w.dumps(value).encode(),
-    "msgpack": msgspec.msgpack.encode, "mcap": _mcap_together}
+    "msgpack": msgspec.msgpack.encode}

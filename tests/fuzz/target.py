@@ -90,7 +90,7 @@ class Target:
         run: decodes an input.
         refuses: its documented errors.
         samples: returns inputs that it accepts, from which others are made.
-        form: of its input, for `inputs`: text, binary, json, msgpack, toml or mcap.
+        form: of its input, for `inputs`: text, binary, json, msgpack or toml.
         words: of its language.
         one_line: whether the text of its errors is one printable line.
     """
