@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.manager.drawing.diagram import Diagram, Situation, draw
+from rampart.manager.drawing.diagram import Diagram, draw
 from rampart.manager.drawing.placing import place
 from rampart.manager.spec.clearing import clearing_in_words, never_cleared
 from rampart.manager.spec.schema import SystemSpec
@@ -81,9 +81,7 @@ def draw_system(spec: SystemSpec) -> dict[str, Any]:
 
     A drawing is None if the system has none, or if it is too large (see `note`).
     """
-    order = spec.build_order()
-    tree = draw(spec, "fault-tree", order, spec.criteria, Situation())
-    ranks = draw(spec, "order", order, spec.criteria, Situation())
+    tree, ranks = draw(spec, "fault-tree"), draw(spec, "order")
     note = (f"The fault tree has {len(tree.boxes)} events, too many to draw (at most {MAX_BOXES})."
             if len(tree.boxes) > MAX_BOXES else "")
     return {"title": spec.title or spec.name, "titles": spec.titles,

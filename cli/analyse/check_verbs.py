@@ -1,4 +1,4 @@
-"""`rampart check` and `rampart explain`: soundness and description of a system, without a run."""
+"""`rampart check` and `rampart explain`: soundness of a system, and what its detections cause."""
 
 from __future__ import annotations
 
@@ -9,28 +9,16 @@ from typing import Any
 import msgspec
 
 from rampart.actors.foreign.program import wrong_programs
-from rampart.actors.runtime.run_plan import SUPERVISOR
-from rampart.actors.supervision.process_title import POOL, RUN
-from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.output import print_json, print_table, say, warn
 from rampart.cli.verbs import JSON, add_verb, flag
 from rampart.manager.analysis.pairs import Pair, pairs
-from rampart.manager.spec.schema import Kind, SystemSpec
+from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
 
 _ROOT = "root"
-
-
-class Process(msgspec.Struct, frozen=True):
-    """A process: its actors by name and class, and which part restarts it, if any."""
-
-    name: str
-    nodes: dict[str, str]
-    kind: str
-    brought_back_by: str
 
 
 class Consequence(msgspec.Struct, frozen=True):
@@ -65,7 +53,6 @@ class Explanation(msgspec.Struct, frozen=True):
     system: str
     title: str
     strategy: str
-    processes: tuple[Process, ...]
     consequences: tuple[Consequence, ...]
 
 
@@ -73,7 +60,7 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     add_verb(verbs, "check", "check a system without running it", check,
              systems.choice(), JSON)
-    add_verb(verbs, "explain", "list processes and consequences of detections", run,
+    add_verb(verbs, "explain", "list the consequence of each detection", run,
              systems.choice(), flag("--pairs", "list what is decided for each ordered pair of "
                                     "mechanisms, and what stays when one of them clears"), JSON)
 
@@ -81,10 +68,10 @@ def add(verbs: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Explain a system.
 
-    Describe a system: its processes, their actors and which part restarts them, and
-    the consequence of each detection. That is: its mechanisms, the recovery that is
+    Explain the consequence of each detection: its mechanisms, the recovery that is
     chosen if nothing else is active, and the next one if that fails. `rampart topic
-    info` lists publishers and readers of a topic.
+    info` lists publishers and readers of a topic, `rampart node list` the processes of
+    a run.
 
     Examples:
       rampart explain
@@ -94,15 +81,15 @@ def run(options: argparse.Namespace) -> int:
 
     exit code: 0 described, 2 `rampart check` refuses the system, or bad usage
     """
-    layout = systems.check(options.system)
+    spec = systems.check(options.system).spec
     if options.pairs:
-        table = pairs(layout.spec)
+        table = pairs(spec)
         if options.json:
             print_json(table)
         else:
-            _show_pairs(layout.spec, table)
+            _show_pairs(spec, table)
         return 0
-    found = explain(layout)
+    found = explain(spec)
     if options.json:
         print_json(found)
     else:
@@ -110,28 +97,9 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def explain(layout: Layout) -> Explanation:
+def explain(spec: SystemSpec) -> Explanation:
     """Return the description of a system."""
-    spec = layout.spec
-    return Explanation(
-        spec.name, spec.title, spec.strategy, tuple(_processes(layout)),
-        tuple(_consequences(spec)))
-
-
-def _processes(layout: Layout) -> Iterator[Process]:
-    for name, parent in ((_ROOT, ""), (RUN, ""), (SUPERVISOR, _ROOT), (POOL, _ROOT)):
-        yield Process(name, {}, "supervision", parent)
-    for name in layout.routers:
-        yield Process(name, {}, "supervision", SUPERVISOR)
-    for unit in layout.units.values():
-        yield Process(unit.name, {node.name: node.actor for node in unit.nodes}, unit.kind,
-                      _respawner(layout, unit))
-
-
-def _respawner(layout: Layout, unit: Unit) -> str:
-    """Return the part that restarts a process; the world is not restarted."""
-    ours = unit.kind != Kind.WORLD.value and layout.spec.layers.supervisor_respawn
-    return unit.respawn if unit.respawn != SUPERVISOR or ours else ""
+    return Explanation(spec.name, spec.title, spec.strategy, tuple(_consequences(spec)))
 
 
 def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
@@ -182,16 +150,7 @@ def _joined(recoveries: Sequence[str]) -> str:
 
 
 def _show(found: Explanation) -> None:
-    filled = [process for process in found.processes if process.nodes]
-    count = sum(len(process.nodes) for process in filled)
     say(f"{found.title} ({found.system}), strategy {found.strategy}")
-    say()
-    say(f"{len(filled)} processes, {count} nodes and modules; and "
-        f"{len(found.processes) - len(filled)} processes of supervision")
-    print_table(("process", "kind", "restarted by", "nodes"), [
-        (p.name, p.kind, p.brought_back_by or "-", ", ".join(
-            f"{name} ({actor.partition(':')[2] or 'command'})" for name, actor in p.nodes.items()))
-        for p in found.processes])
     say()
     say("Consequence of each detection, if no other module detects anything")
     for each in found.consequences:

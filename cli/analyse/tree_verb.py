@@ -12,29 +12,20 @@ from collections.abc import Sequence
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, say_text, unknown
-from rampart.cli.verbs import JSON, add_verb, option, word
-from rampart.files.plain_text import one_line
-from rampart.manager.drawing.diagram import WHATS, Box, Diagram, Situation, draw
-from rampart.manager.model.order import CycleError
-from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import decide
+from rampart.cli.output import UsageError, print_json, say_text
+from rampart.cli.verbs import JSON, add_verb, option
+from rampart.manager.drawing.diagram import WHATS, Box, Diagram, draw
 
-ACTIVE = "●"
-DECIDED = "◀ decided"
 ABOVE = "↑"
 
 
 def to_text(diagrams: Sequence[Diagram]) -> str:
     """Return diagrams as text, separated by empty lines."""
-    return "\n\n".join("\n".join(_lines(diagram, noted=number == 0))
-                       for number, diagram in enumerate(diagrams)) + "\n"
+    return "\n\n".join("\n".join(_lines(diagram)) for diagram in diagrams) + "\n"
 
 
-def _lines(diagram: Diagram, *, noted: bool) -> list[str]:
+def _lines(diagram: Diagram) -> list[str]:
     lines = [diagram.title]
-    if diagram.note and noted:
-        lines.append(diagram.note)
     boxes = {box.name: box for box in diagram.boxes}
     below: dict[str, list[str]] = {name: [] for name in boxes}
     lowers = {lower for _, lower in diagram.edges}
@@ -63,13 +54,11 @@ def _lines(diagram: Diagram, *, noted: bool) -> list[str]:
 
 
 def _words(box: Box, diagram: Diagram) -> list[str]:
-    """Return the words of a box: name with its gate, title, barrier, situation."""
+    """Return the words of a box: name with its gate, title, barrier."""
     name = (diagram.what == "ftm-tree" and box.barrier_words) or box.name
     gate = f" [{box.gate_words}]" if box.gate else ""
     barrier = box.barrier_words if diagram.what == "fault-tree" else ""
-    active = f"{ACTIVE} {diagram.active_words}" if box.active else ""
-    return list(filter(None, (
-        name + gate, box.subtitle, barrier, active, DECIDED if box.decided else "")))
+    return list(filter(None, (name + gate, box.subtitle, barrier)))
 
 
 def add(verbs: Any) -> None:
@@ -78,13 +67,7 @@ def add(verbs: Any) -> None:
              systems.choice(),
              option("--what", choices=(*WHATS, "all"), default="all",
                     help="which diagrams (default: all)"),
-             JSON,
-             option("--order", metavar="NAME", action="append",
-                    help="order of recoveries; repeatable: each decides the pairs that the "
-                         "previous ones leave open (default: the system's)"),
-             option("--active", metavar="FTM", nargs="+", default=[],
-                    help="active mechanisms, which are highlighted with the decision"),
-             word("--strategy", "NAME", "strategy that decides (default: the system's)"))
+             JSON)
 
 
 def show_tree(options: argparse.Namespace) -> int:
@@ -96,12 +79,12 @@ def show_tree(options: argparse.Namespace) -> int:
     Examples:
       rampart tree
       rampart tree my_system.toml
-      rampart tree --what ftm-tree --active FTM3 FTM4
       rampart tree --what fault-tree > fault_tree.txt
       rampart tree --what order --json
     """
     spec = systems.load(options.system)
-    diagrams = _draw(spec, WHATS if options.what == "all" else (options.what,), options)
+    whats = WHATS if options.what == "all" else (options.what,)
+    diagrams = [draw(spec, what) for what in whats]
     if options.json:
         print_json(diagrams)
         return 0
@@ -113,25 +96,3 @@ def show_tree(options: argparse.Namespace) -> int:
                          "set PYTHONUTF8=1") from None
     say_text(text.rstrip("\n"))
     return 0
-
-
-def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
-          ) -> tuple[Diagram, ...]:
-    criteria = tuple(options.order or spec.criteria)
-    for name in criteria:
-        if name not in spec.orders:
-            raise unknown("order", name, map(one_line, spec.orders))
-    strategy = options.strategy or spec.strategy
-    try:
-        order = spec.build_order(*criteria)
-    except CycleError as error:
-        raise UsageError(f"--order {' '.join(criteria)}: together they form a {error}") from None
-    situation = Situation()
-    if options.active or options.strategy:
-        decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
-                          order, strategy)
-        situation = Situation(frozenset(decision.active), decision.recoveries, decision.rule,
-                              strategy)
-    return tuple(draw(spec, what, order, criteria, situation) for what in whats)
-
-

@@ -1,11 +1,9 @@
 """Diagrams of a system: its fault tree, its FTMTree, its order of the recoveries.
 
-Each is a directed graph of boxes for any renderer. The boxes show what is active and decided.
+Each is a directed graph of boxes for any renderer.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import msgspec
 
@@ -13,7 +11,6 @@ from rampart.files.plain_text import one_line
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
-from rampart.manager.strategies.registry import decision_in_words
 
 WHATS = ("fault-tree", "ftm-tree", "order")
 """Names of the diagrams."""
@@ -27,9 +24,6 @@ class Box(msgspec.Struct, frozen=True):
         required: How many inputs the gate needs.
         inputs: How many inputs the gate has.
         mechanism: The mechanism of the box, or the barrier on the event.
-        active: The mechanism is active; of a recovery: an active mechanism has it.
-        decided: The recovery runs, or the mechanism asks for one that runs; if no active mechanism
-            does, each mechanism with that recovery.
     """
 
     name: str
@@ -40,8 +34,6 @@ class Box(msgspec.Struct, frozen=True):
     mechanism: str = ""
     detect: str = ""
     recover: str = ""
-    active: bool = False
-    decided: bool = False
 
     @property
     def subtitle(self) -> str:
@@ -61,54 +53,24 @@ class Box(msgspec.Struct, frozen=True):
 
 
 class Diagram(msgspec.Struct, frozen=True):
-    """A graph to draw: one of `WHATS`, with edges (upper box, lower box).
-
-    `note` is the situation in one line, "" if nothing is active.
-    """
+    """A graph to draw: one of `WHATS`, with edges (upper box, lower box)."""
 
     what: str
     title: str
-    note: str
     boxes: tuple[Box, ...]
     edges: tuple[tuple[str, str], ...]
 
-    @property
-    def active_words(self) -> str:
-        """The word for an active box of this diagram."""
-        return "asked for" if self.what == "order" else "active"
 
-
-class Situation(msgspec.Struct, frozen=True):
-    """Active mechanisms, and the decision on them."""
-
-    active: frozenset[str] = frozenset()
-    recoveries: tuple[str, ...] = ()
-    rule: int = 0
-    strategy: str = ""
-
-    def note(self, spec: SystemSpec) -> str:
-        """Return the situation in one line."""
-        if not self.active:
-            return ""
-        active = [m.name for m in spec.mechanisms if m.name in self.active]
-        return decision_in_words(active, self.rule, self.recoveries, self.strategy,
-                                 spec.titles)
-
-
-def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[str],
-         situation: Situation) -> Diagram:
-    """Return a diagram of a system, one of `WHATS`.
-
-    `criteria` are the names of the orders of which `order` consists.
-    """
+def draw(spec: SystemSpec, what: str) -> Diagram:
+    """Return a diagram of a system, one of `WHATS`."""
     if what == "fault-tree":
-        subject, parts = "Fault tree", _fault_tree(spec, situation)
+        subject, parts = "Fault tree", _fault_tree(spec)
     elif what == "ftm-tree":
-        subject, parts = "Tree of mechanisms", _ftm_tree(spec, situation)
+        subject, parts = "Tree of mechanisms", _ftm_tree(spec)
     else:
-        subject = f"Order of recoveries ({', then '.join(map(one_line, criteria))})"
-        parts = _order(spec, order, situation)
-    return Diagram(what, f"{subject}: {one_line(spec.title)}", situation.note(spec), *parts)
+        subject = f"Order of recoveries ({', then '.join(map(one_line, spec.criteria))})"
+        parts = _order(spec)
+    return Diagram(what, f"{subject}: {one_line(spec.title)}", *parts)
 
 
 def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
@@ -120,18 +82,18 @@ def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
 _Parts = tuple[tuple[Box, ...], tuple[tuple[str, str], ...]]
 
 
-def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
+def _fault_tree(spec: SystemSpec) -> _Parts:
     boxes = {}
     for event in spec.events:
         gate = event.gate if isinstance(event.gate, str) else "at-least" if event.of else ""
         boxes[event.name] = Box(
             event.name, one_line(event.title), gate, event.required, len(event.of))
     for mechanism in spec.mechanisms:
-        boxes[mechanism.event] = _bar(boxes[mechanism.event], mechanism, spec, situation)
+        boxes[mechanism.event] = _bar(boxes[mechanism.event], mechanism)
     return tuple(boxes.values()), tuple((e.name, lower) for e in spec.events for lower in e.of)
 
 
-def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
+def _ftm_tree(spec: SystemSpec) -> _Parts:
     titles = {d.name: one_line(d.title) for d in spec.detections}
     titles |= {r.name: one_line(r.title) for r in spec.recoveries}
     boxes = []
@@ -139,28 +101,18 @@ def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
         detects, recovers = (str(gate.renamed(titles)) for gate in (
             detection_gate(mechanism.detect), recovery_gate(mechanism.recover)))
         box = Box(mechanism.name, f"{detects} → {recovers}")
-        boxes.append(_bar(box, mechanism, spec, situation))
+        boxes.append(_bar(box, mechanism))
     parents = spec.build_ftm_tree().parents if boxes else {}
     return tuple(boxes), tuple((parent, m) for m, parent in parents.items() if parent is not None)
 
 
-def _order(spec: SystemSpec, order: PartialOrder, situation: Situation) -> _Parts:
-    asked = {r for m in spec.mechanisms if m.name in situation.active for r in m.recoveries}
-    boxes = tuple(Box(r.name, one_line(r.title), active=r.name in asked,
-                      decided=r.name in situation.recoveries) for r in spec.recoveries)
-    return boxes, covers(order)
+def _order(spec: SystemSpec) -> _Parts:
+    return (tuple(Box(r.name, one_line(r.title)) for r in spec.recoveries),
+            covers(spec.build_order()))
 
 
-def _bar(box: Box, mechanism: MechanismSpec, spec: SystemSpec, situation: Situation) -> Box:
-    """Return a box with a mechanism.
-
-    It counts as decided if its recovery runs and it is active. After block 4 no active mechanism
-    has the recovery; then activity does not matter.
-    """
-    decided = [m.name for m in spec.mechanisms
-               if not set(m.recoveries).isdisjoint(situation.recoveries)]
-    active = mechanism.name in situation.active
+def _bar(box: Box, mechanism: MechanismSpec) -> Box:
+    """Return a box with a mechanism."""
     return msgspec.structs.replace(
         box, mechanism=mechanism.name, detect=one_line(mechanism.detect),
-        recover=one_line(mechanism.recover), active=active, decided=mechanism.name in decided and (
-            active or situation.active.isdisjoint(decided)))
+        recover=one_line(mechanism.recover))

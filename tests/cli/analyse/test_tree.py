@@ -36,7 +36,7 @@ def graph(edges, **boxes) -> Diagram:
     """Return a fault tree; the gates follow from the edges."""
     names = list(dict.fromkeys([*itertools.chain.from_iterable(edges), *boxes]))
     inputs = {name: sum(upper == name for upper, _ in edges) for name in names}
-    return Diagram("fault-tree", "T", "", tuple(
+    return Diagram("fault-tree", "T", tuple(
         boxes.get(name) or Box(name, gate="or" if inputs[name] else "", inputs=inputs[name],
                                required=min(1, inputs[name])) for name in names), tuple(edges))
 
@@ -56,9 +56,8 @@ def fault_trees(draw_from):
         gate = "" if not inputs else draw_from(st.sampled_from(["or", "and", "at-least"]))
         mechanism = f"F{i}" if draw_from(st.booleans()) else ""
         title = one_line(draw_from(st.text(max_size=40)))
-        boxes.append(Box(name, title, gate, required, inputs, mechanism, f"D{i}", f"R{i}",
-                         draw_from(st.booleans()), draw_from(st.booleans())))
-    return Diagram("fault-tree", "T", "", tuple(boxes), tuple(edges))
+        boxes.append(Box(name, title, gate, required, inputs, mechanism, f"D{i}", f"R{i}"))
+    return Diagram("fault-tree", "T", tuple(boxes), tuple(edges))
 
 
 def assert_apart(boxes) -> None:
@@ -126,14 +125,15 @@ def hostile_system(tmp_path):
     text = systems.DEFAULT.read_text(encoding="utf-8")
     for title in ("Erroneous graph", "Emergency stop", "Runway light inspection with a Summit XL"):
         text = text.replace(f'"{title}"', json.dumps(HOSTILE))
-    text += f"\n[orders.{json.dumps(HOSTILE)}]\nRM1 = ['RM2', 'RM5']\n"
+    text = text.replace('order = "safer"', f"order = {json.dumps(HOSTILE)}")
+    text = text.replace("[orders.safer]", f"[orders.{json.dumps(HOSTILE)}]")
     file = tmp_path / "hostile.toml"
     file.write_text(text, encoding="utf-8")
     return file
 
 
 def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path):
-    tree = ["tree", "--system", str(hostile_system(tmp_path)), "--order", HOSTILE]
+    tree = ["tree", "--system", str(hostile_system(tmp_path))]
     shown = []
     for more in ((), ("--json",)):
         assert main([*tree, *more]) == 0
@@ -158,22 +158,6 @@ def test_a_thousand_events_are_drawn_and_placed(edges):
     for _, row in itertools.groupby(at, key=lambda box: box[0]):
         assert all(a[1] + a[2] <= b[1] for a, b in itertools.pairwise(row))
     assert to_text([diagram]).count("\n") == 1 + len(edges) + 1
-
-
-@pytest.mark.parametrize(("active", "decided"), [
-    (["FTM3", "FTM4"], ["FTM3"]),  # RM2 for FTM3; FTM2 has RM2 as well and is not active
-    (["FTM2", "FTM6", "FTM5"], ["FTM1"]),  # block 4: nobody active asks for RM1
-])
-def test_active_mechanisms_are_lit_and_the_decision_is_marked(capsys, active, decided):
-    assert main(["tree", "--what", "ftm-tree", "--json", "--active", *active]) == 0
-    (tree,) = json.loads(told(capsys))
-    assert {b["name"] for b in tree["boxes"] if b["active"]} == set(active)
-    assert [b["name"] for b in tree["boxes"] if b["decided"]] == decided
-    main(["tree", "--what", "ftm-tree", "--active", *active])
-    lines = told(capsys).splitlines()
-    assert all(f"({name})" in lines[1] for name in active)
-    assert sum("● active" in line for line in lines) == len(active)
-    assert sum("◀ decided" in line for line in lines) == 1
 
 
 def test_a_terminal_without_these_characters_is_told_so(capsys, monkeypatch):
