@@ -76,8 +76,7 @@ class OsmosisViews(Views):
             topics.SCAN: partial(_sweep, "view/scan"),
             topics.UPPER_SCAN: partial(_sweep, "view/upper_scan"),
             topics.OBSTACLES: self._obstacles, topics.ROUTE: self._route,
-            topics.LIGHT_MEASURED: self._light, topics.MISSION_STATUS: self._mission,
-            topics.MISSION_ORDER: self._order, topics.MISSION_ORDER_ANSWER: self._answer}
+            topics.LIGHT_MEASURED: self._light, topics.MISSION_STATUS: self._mission}
 
     def start(self, at_ns: int) -> list[View]:
         """Return the views that depend on no message."""
@@ -145,20 +144,6 @@ class OsmosisViews(Views):
                 f"mission {body.name} {body.phase.value}, {body.step} of {len(body.goals)} goals "
                 f"reached{why}"))
         return views
-
-    def _order(self, key: str, header: Header, body: m.MissionOrder, at_ns: int) -> list[View]:
-        return self._once(key, header, body.order, at_ns,
-                          f"order {body.action.value} by {body.by}: {body.reason}")
-
-    def _answer(self, key: str, header: Header, body: m.MissionOrderAnswer, at_ns: int
-                ) -> list[View]:
-        return self._once(key, header, body.order, at_ns,
-                          f"order {'obeyed' if body.accepted else 'refused'}: {body.reason}")
-
-    def _once(self, key: str, header: Header, order: str, at_ns: int, text: str) -> list[View]:
-        """Return a line of the log, once per order and key."""
-        return [line(at_ns, fg.LogLevel.INFO, header.source, text)] \
-            if self.is_new(key, order) else []
 
 
 def _finite(pose: m.Pose) -> bool:
