@@ -38,8 +38,6 @@ STANDING_RADPS = 0.05
 """A slower wheel, 6 mm/s at its tread, stands: a brake has no effect."""
 
 
-MAX_IN_FORCE = 64
-"""Most faults at a time."""
 
 _REMEMBERED = 256
 """Number of ended faults whose count is reported again on request."""
@@ -156,8 +154,6 @@ class ActuatorFaults:
         if order.kind != ActuatorFaultKind.BRAKE_FAILURE and order.wheel not in WHEEL_NAMES:
             raise WorldError(f"wheel = {order.wheel!r}: expected one of {', '.join(WHEEL_NAMES)}")
         before = self._in_force.get(injection)
-        if before is None and len(self._in_force) >= MAX_IN_FORCE:
-            raise WorldError(f"faults: {MAX_IN_FORCE} in force: expected no more at a time")
         affected_ticks = before.affected_ticks if before else 0
         self._in_force[injection] = _InForce(order, now_s + order.duration_s, affected_ticks)
         self._weigh()

@@ -152,15 +152,11 @@ def read_airport(graph: Path) -> Airport:
     first = next(iter(nodes))
     second = next((b if a == first else a for a, b in edges if first in (a, b)), first)
     (x_m, y_m), (to_x, to_y) = nodes[first], nodes[second]
-    missions: dict[str, Mission] = {}
-    for path in sorted(graph.parent.glob("*.miss")):
-        mission = read_mission(path)
-        if mission.name in missions:
-            raise AirportError(f"{path}: mission name: {mission.name!r}: duplicate name")
-        missions[mission.name] = mission
+    missions = [read_mission(path) for path in sorted(graph.parent.glob("*.miss"))]
     return Airport(graph.stem, nodes, edges, allowed,
                    model.StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
-                   (model.Surface(graph.stem, "area", allowed),), missions=missions)
+                   (model.Surface(graph.stem, "area", allowed),),
+                   missions={mission.name: mission for mission in missions})
 
 
 def images_beside(graph: Path) -> list[Path]:

@@ -24,6 +24,7 @@ from shapely.geometry import box
 
 from rampart.files.plain_text import one_line
 from rampart.files.reading import FileError
+from rampart.manager.spec.tables import NonNegative, Positive
 
 
 class AirportError(ValueError):
@@ -145,9 +146,9 @@ class Building(Record, frozen=True):
     name: str
     x_m: float
     y_m: float
-    length_m: float
-    width_m: float
-    height_m: float
+    length_m: Positive
+    width_m: Positive
+    height_m: Positive
     yaw_rad: float = 0.0
 
     @property
@@ -174,10 +175,10 @@ class ObstaclePreset(Record, frozen=True):
     shape: ObstacleShape
     x_m: float
     y_m: float
-    radius_m: float
-    present_from_s: float = 0.0
-    appears_within_m: float | None = None
-    gone_after_s: float | None = None
+    radius_m: Annotated[float, msgspec.Meta(ge=0.05, le=5.0)]
+    present_from_s: NonNegative = 0.0
+    appears_within_m: NonNegative | None = None
+    gone_after_s: NonNegative | None = None
 
 
 class Attachment(msgspec.Struct, frozen=True):

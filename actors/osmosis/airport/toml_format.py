@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
+import msgspec
 import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
@@ -24,30 +25,32 @@ from rampart.files import toml
 from rampart.files.plain_text import shown
 from rampart.files.reading import read_text
 from rampart.manager.spec.reading import MisfitError, read
+from rampart.manager.spec.tables import NonNegative, Positive
 
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
+Outline = Annotated[tuple[Point, ...], msgspec.Meta(min_length=3)]
 T = TypeVar("T")
 
 
 class _Surface(Record, frozen=True):
     name: Name
     kind: SurfaceKind
-    polygon: tuple[Point, ...] | None = None
-    centre_line: tuple[Point, ...] | None = None
-    half_width_m: float | None = None
+    polygon: Outline | None = None
+    centre_line: Annotated[tuple[Point, ...], msgspec.Meta(min_length=2)] | None = None
+    half_width_m: Positive | None = None
 
 
 class _Area(Record, frozen=True):
     name: Name
-    polygon: tuple[Point, ...]
+    polygon: Outline
 
 
 class _Row(Record, frozen=True):
     name: Name
-    nominal_cd: float
+    nominal_cd: Positive
     first: Point | None = None
     last: Point | None = None
-    count: int | None = None
+    count: Annotated[int, msgspec.Meta(ge=2)] | None = None
     positions: tuple[Point, ...] | None = None
 
 
@@ -56,7 +59,7 @@ class _Mission(Record, frozen=True):
 
 
 class _World(Record, frozen=True):
-    light_factors: dict[str, float] = {}
+    light_factors: dict[str, Annotated[float, msgspec.Meta(ge=0, le=2)]] = {}
 
 
 class _File(Record, frozen=True):
@@ -65,7 +68,7 @@ class _File(Record, frozen=True):
     nodes: dict[str, Point]
     edges: tuple[tuple[str, str], ...]
     surface: tuple[_Surface, ...]
-    fillet_radius_m: float = 0.0
+    fillet_radius_m: NonNegative = 0.0
     prohibited: tuple[_Area, ...] = ()
     building: tuple[model.Building, ...] = ()
     row: tuple[_Row, ...] = ()
@@ -87,14 +90,9 @@ def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
     surfaces = _surfaces(file.surface, name)
     prohibited = [_polygon(area.polygon, f"prohibited[{i}].polygon", name)
                   for i, area in enumerate(file.prohibited)]
-    if file.fillet_radius_m < 0:
-        raise _error(name, "fillet_radius_m", file.fillet_radius_m, "must not be negative")
     for table in ("surface", "prohibited", "building", "row"):
         for twice in model.repeated(part.name for part in getattr(file, table)):
             raise _error(name, table, repr(twice), "duplicate name")
-    for building in file.building:
-        if min(building.length_m, building.width_m, building.height_m) <= 0:
-            raise _error(name, f"building.{building.name}", "size", "must be positive")
     solid = [building.polygon for building in file.building]
     pavement = [part.polygon for part in surfaces]
     allowed = shapely.unary_union(pavement)
@@ -151,11 +149,8 @@ def _surfaces(parts: tuple[_Surface, ...], file: str) -> tuple[model.Surface, ..
             raise _error(file, where, part.name, "expected either polygon or centre_line")
         if part.polygon is not None:
             shape = _polygon(part.polygon, f"{where}.polygon", file)
-        elif part.centre_line is None or len(part.centre_line) < 2:
-            raise _error(file, f"{where}.centre_line", shown(part.centre_line),
-                         "expected two or more points")
-        elif half_m is None or half_m <= 0:
-            raise _error(file, f"{where}.half_width_m", half_m, "must be positive")
+        elif half_m is None:
+            raise _error(file, f"{where}.half_width_m", half_m, "missing beside centre_line")
         else:
             line = LineString(part.centre_line)
             shape = line.buffer(half_m, cap_style="flat" if part.kind == "runway" else "round")
@@ -164,8 +159,6 @@ def _surfaces(parts: tuple[_Surface, ...], file: str) -> tuple[model.Surface, ..
 
 
 def _polygon(points: tuple[Point, ...], where: str, file: str) -> Any:
-    if len(points) < 3:
-        raise _error(file, where, shown(points), "expected three or more points")
     shape = Polygon(points)
     if not shape.is_valid or shape.area == 0:
         raise _error(file, where, explain_validity(shape), "must not cross itself")
@@ -179,8 +172,6 @@ def _lights(row: _Row, i: int, file: str) -> list[model.Light]:
         raise _error(file, where, row.name, "expected either first, last and count, or positions")
     points = row.positions or ()
     if row.first is not None and row.last is not None and row.count is not None:
-        if row.count < 2:
-            raise _error(file, f"{where}.count", row.count, "expected two or more lights")
         (ax, ay), (bx, by), gaps = row.first, row.last, row.count - 1
         points = tuple(
             (ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count))
@@ -190,12 +181,10 @@ def _lights(row: _Row, i: int, file: str) -> list[model.Light]:
 
 def _truth(world: _World, airport: model.Airport, file: str) -> WorldTruth:
     known = {light.name for light in airport.lights}
-    for name, factor in world.light_factors.items():
-        where = f"world.light_factors.{name}"
+    for name in world.light_factors:
         if name not in known:
-            raise _error(file, where, repr(name), "unknown light; expected one of a row, e.g. A01")
-        if not 0 <= factor <= 2:
-            raise _error(file, where, factor, "expected a factor of the nominal intensity, 0 to 2")
+            raise _error(file, f"world.light_factors.{name}", repr(name),
+                         "unknown light; expected one of a row, e.g. A01")
     return WorldTruth(world.light_factors)
 
 

@@ -103,8 +103,6 @@ class Polyline:
     """
 
     def __init__(self, points: Sequence[Point]) -> None:
-        if not points:
-            raise ValueError("polyline: points: empty, expected at least one")
         kept = [points[0]]
         for point in points[1:]:
             if math.dist(point, kept[-1]) > 1e-9:

@@ -254,11 +254,10 @@ class MissionConsole(Console):
 
     def verdict(self, record: RunRecord) -> list[str]:
         """Return the lines of the verdict."""
-        if isinstance(record, MissionRecord):
-            return [f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
-                    f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.",
-                    headline(record)]
-        return super().verdict(record)
+        made = _mission(record)
+        return [f"Mission {made.mission_name}: {made.mission}, {made.safety}, "
+                f"{made.duration_s:.1f} s simulated, {made.distance_m:.0f} m driven.",
+                headline(made)]
 
     def _take_mission(self, status: m.MissionStatus, at: float) -> None:
         self._mission = status

@@ -85,8 +85,6 @@ SHIFT_M = 0.15
 POSE_GAP_S = 0.3
 """Greatest time between the two poses around a sample."""
 
-KEEP_S = 120.0
-"""Older samples are dropped: the pose of a robot that waited may have changed."""
 
 
 def verdict(ratio: float) -> LightVerdict:
@@ -156,15 +154,10 @@ class LightInspection:
                 continue
             off_m = np.hypot(self._x_m - place[0], self._y_m - place[1])
             for index in np.flatnonzero(off_m <= FIT_RADIUS_M):
-                samples = self._samples.setdefault(int(index), [])
-                if samples and stamp_s - samples[0][0] > KEEP_S:
-                    samples.clear()
-                samples.append((stamp_s, *place, lux))
+                self._samples.setdefault(int(index), []).append((stamp_s, *place, lux))
 
     def _sensor_at(self, stamp_s: float) -> Point | None:
         after = bisect.bisect_left(self._poses, stamp_s, key=itemgetter(0))
-        if after >= len(self._poses):
-            return None
         b_s, bx, by, b_yaw = self._poses[after]
         if b_s == stamp_s:
             return sensor_position(bx, by, b_yaw)

@@ -39,11 +39,7 @@ class Closures(msgspec.Struct):
     _until_s: dict[Point, float] = msgspec.field(default_factory=lambda: Remembered(MOST_PLACES))
 
     def close(self, place: Point, now_s: float) -> None:
-        """Close the graph around a place in `map`, or renew the closure of a place near it."""
-        for known in self._until_s:
-            if math.dist(known, place) <= self.gap_m:
-                self._until_s[known] = now_s + self.lasts_s
-                return
+        """Close the graph around a place in `map`."""
         self._until_s[place] = now_s + self.lasts_s
 
     def reopen(self) -> None:
@@ -214,7 +210,6 @@ def _search(nodes: Mapping[str, Point], edges: list[Edge], start: Attachment,
 
     cost: dict[str | int, float] = {0: 0.0}
     came: dict[str | int, str | int] = {}
-    done: set[str | int] = set()
     ties = itertools.count(1)
     queue: list[tuple[float, int, str | int]] = [(math.dist(start.point, goal.point), 0, 0)]
     while queue:
@@ -225,9 +220,6 @@ def _search(nodes: Mapping[str, Point], edges: list[Edge], start: Attachment,
                 place = came[place]
                 path.append(places[place])
             return path[::-1]
-        if place in done:
-            continue
-        done.add(place)
         for beyond in ways[place]:
             total = cost[place] + math.dist(places[place], places[beyond])
             if total < cost.get(beyond, math.inf):

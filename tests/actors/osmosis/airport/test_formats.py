@@ -110,18 +110,15 @@ def test_our_own_format_gives_lights_missions_obstacles_and_pavement(tmp_path):
     ("T = [30.0, 0.0]", "T = [nan, 0.0]", "nodes.T[0]: nan: must be a finite number"),
     ("T = [30.0, 0.0]", "T = [30.0, 20.0]", "in the prohibited area; expected on the pavement"),
     ("T = [30.0, 0.0]", "S = [30.0, 0.0]", "file: not valid TOML: "),
-    ("half_width_m = 3.0", "half_width_m = -3.0", "surface[0].half_width_m: -3.0: must be pos"),
+    ("half_width_m = 3.0", "half_width_m = -3.0", "half_width_m: -3.0: expected a number > 0"),
+    ("half_width_m = 3.0", "", "surface[0].half_width_m: None: missing beside centre_line"),
     ("half_width_m = 3.0", "half_widht_m = 3.0", "surface[0].half_widht_m: 3.0: unknown field"),
-    ("centre_line = [[-3, 0], [33, 0]]", "centre_line = [[-3, 0]]", "expected two or more points"),
     ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9],[9,0],[0,9]]",
      "surface[0].polygon: Self-intersection"),
-    ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9]]", "three or more points"),
     ("centre_line = [[-3, 0], [33, 0]]", "", "expected either polygon or centre_line"),
     ("count = 3", "", "row[0]: R: expected either first, last and count, or positions"),
     ('name = "Field"', "", "file: required field 'name' is missing"),
-    ("count = 3", "count = 1", "row[0].count: 1: expected two or more lights"),
     ("R02 = 0.25", "R09 = 0.25", "world.light_factors.R09: 'R09': unknown light"),
-    ("R02 = 0.25", "R02 = -1.0", "world.light_factors.R02: -1.0: expected a factor"),
     ("[[surface]]", '[[surface]]\nname = "Runway"\nkind = "apron"\n'
      "polygon = [[0,0],[1,0],[0,1]]\n[[surface]]", "surface: 'Runway': duplicate name")])
 def test_a_broken_airport_is_refused_in_one_line_with_file_field_and_value(

@@ -65,13 +65,9 @@ def test_a_footprint_is_in_the_prohibited_area_as_soon_as_one_corner_is():
         ({"start": StartPose(3, 10, 0), "nodes": {"NE": (17.0, 17.0)}, "edges": ()},
          "start: 15.7 m from the graph"),
         ({"lights": (Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
-        ({"lights": (Light("L1", "L", 3, 3, 0),)}, "row.L1.nominal_cd: must be positive"),
         ({"lights": (Light("L1", "L", 3, 3, 1),) * 2}, "row: duplicate name of a light"),
         ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3),) * 2}, "obstacle: duplicate name"),
-        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 9),)}, "obstacle.o.radius_m: must be in"),
         ({"obstacles": (ObstaclePreset("o", "box", 3.2, 3, 0.3),)}, "obstacle.o: on the start"),
-        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3, gone_after_s=-1),)},
-         "obstacle.o.gone_after_s: must not be negative"),
         ({"allowed": shapely.Polygon()}, "surface: the airport needs pavement"),
 ])
 def test_each_fault_of_an_airport_is_found_and_named(changes, expected):
