@@ -22,6 +22,11 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
     "google-chrome")
 
 
+SHORT = ("var $ = (css) => document.querySelector(css);"
+         "var $$ = (css) => [...document.querySelectorAll(css)];")
+"""Short names for scripts of tests: the first element of a selector, and all."""
+
+
 class Browser:
     """One tab, or Chromium; `errors`: what the page complained of, `requests`: what it loaded."""
 
@@ -69,6 +74,7 @@ class Browser:
         await self.call("Runtime.enable")
         await self.call("Log.enable")
         await self.call("Network.enable")
+        await self.call("Page.addScriptToEvaluateOnNewDocument", source=SHORT)
         await self.call("Page.navigate", url=url)
 
     async def value(self, expression: str) -> Any:

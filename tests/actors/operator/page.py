@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 
 from tests.actors.operator.world import AIRPORT, SPEC, World, served
 
-LIVE = "document.getElementById('link').textContent === 'live'"
+LIVE = "$('#link').textContent === 'live'"
 
 
 async def show(tab, hmi, **look) -> None:
@@ -20,15 +20,14 @@ async def page(world: World, tab, airport=AIRPORT, system=SPEC, **look):
     """Show the page of an HMI that knows the system and an airport."""
     async with world.hmi(system=system, airport=airport) as hmi:
         await show(tab, hmi, **look)
-        await tab.until("document.querySelectorAll('#tree .event').length > 0")
+        await tab.until("$$('#tree .event').length > 0")
         yield hmi
 
 
 def text(name: str) -> str:
     """Return an expression for the text of an element with an id."""
-    return f"document.getElementById('{name}').textContent"
+    return f"$('#{name}').textContent"
 
 
 def events(kind: str) -> str:
-    return (f"[...document.querySelectorAll('#tree .event.{kind} .ftm')]"
-            ".map((t) => t.textContent).join()")
+    return (f"$$('#tree .event.{kind} .ftm').map((t) => t.textContent).join()")

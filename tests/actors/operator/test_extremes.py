@@ -45,13 +45,13 @@ async def test_a_system_that_is_none_is_reported_and_the_one_before_stays(world,
 @pytest.mark.page
 async def test_of_3000_lights_many_are_drawn_and_the_others_counted(
         world, tab):
-    lights = "document.querySelectorAll('#map .light')"
+    lights = "$$('#map .light')"
     many = dataclasses.replace(AIRPORT, lights=tuple(
         Light(f"L{i:05}", f"row {i // 50}", i % 50, i / 50, 200.0) for i in range(3000)))
     async with world.hmi(airport=many) as hmi:
         await show(tab, hmi)
         await tab.until(f"{lights}.length === {MAX_LIGHTS}")
-        assert await tab.value("document.getElementById('left-out').textContent") == (
+        assert await tab.value("$('#left-out').textContent") == (
             f"Too much to show: {3000 - MAX_LIGHTS} of the lights left out.")
         hmi._light(m.LightMeasurement("L00007", 0.0, 0.0, m.LightVerdict.OUT),
                    Header("osmosis_control", 1, 1, 0.0))
@@ -64,8 +64,7 @@ async def test_of_3000_lights_many_are_drawn_and_the_others_counted(
         await tab.until(f"{out} === 0")
         hmi._manager(fm.ManagerStatus(("x",) * 5000, (), (), ("RM1",), "", 1),
                      Header("x", 1, 1, 0.0))
-        await tab.until("document.getElementById('left-out').textContent"
-                        ".endsWith('4800 of the manager left out.')")
+        await tab.until("$('#left-out').textContent.endsWith('4800 of the manager left out.')")
         shown = json.loads(hmi._server._feed.frame(0))["manager"]["value"]
         assert [len(shown[name]) for name in ("active", "latched")] == [200, 1]
 
@@ -149,15 +148,14 @@ async def test_markup_in_every_text_of_the_bus_the_airport_and_the_panels_is_ine
             for shown in ("toast", "mission-reason", "pilot-reason", "manager", "resets", "events",
                           "decisions", "nodes", "airport", "mission-name", "alarm-title", "map",
                           "tree-title", "strategy-now", "detections"):
-                await tab.until(f"document.getElementById('{shown}').textContent"
-                                ".includes('<img src=x')")
+                await tab.until(f"$('#{shown}').textContent.includes('<img src=x')")
             for name in ("List", "States", MARKUP[:60]):
-                await tab.until("[...document.querySelectorAll('.panel')].find((p) => p.dataset"
+                await tab.until("$$('.panel').find((p) => p.dataset"
                                 f".name === {json.dumps(name)}).textContent.includes('<img src=x')")
-        await tab.value("document.querySelectorAll('#nodes button')[0].click()")
-        await tab.until("document.getElementById('signal-node').textContent.includes('<img')")
+        await tab.value("$$('#nodes button')[0].click()")
+        await tab.until("$('#signal-node').textContent.includes('<img')")
         assert await tab.value("document.images.length") == 0
-        made = "document.querySelectorAll(\"body script, [data-name^='<img'] b\").length"
+        made = "$$(\"body script, [data-name^='<img'] b\").length"
         assert await tab.value(made) == 0
         assert await tab.value("window.broken === undefined") is True
         assert [url for url in tab.requests if url.endswith("/x")] == []

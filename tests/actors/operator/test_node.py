@@ -139,7 +139,7 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
     assert "choose another port" in report.reason
 
 
-BUTTONS = "[...document.querySelectorAll('#orders button:enabled')].map((b) => b.dataset.order)"
+BUTTONS = "$$('#orders button:enabled').map((b) => b.dataset.order)"
 
 
 @pytest.mark.page
@@ -147,12 +147,12 @@ async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_
         world, hmi, tab):
     p, a = m.MissionPhase, m.MissionAction
     await show(tab, hmi)
-    await tab.until("document.getElementById('orders')?.hidden")
+    await tab.until("$('#orders')?.hidden")
     async with repeated(lambda: world.say(p.PAUSED, a.RESUME, a.CANCEL)):
         await tab.until(f"{BUTTONS}.join() === '{a.RESUME},{a.CANCEL}'")
     async with repeated(lambda: world.say(p.RUNNING, *a)):
         await tab.until(f"{BUTTONS}.length === 5")
-        await tab.value("document.querySelector('[data-order=pause]').focus()")
+        await tab.value("$('[data-order=pause]').focus()")
         for kind in ("rawKeyDown", "char", "keyUp"):
             await tab.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter",
                            windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
@@ -160,12 +160,12 @@ async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_
         await eventually(lambda: {o.action for o in world.others.orders} == {a.PAUSE})
         world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
             world.others.orders[0].order, True, ""))
-        await tab.until("document.getElementById('toast').textContent === 'pause obeyed'")
-        cancel = "document.querySelector('[data-order=cancel]')"
+        await tab.until("$('#toast').textContent === 'pause obeyed'")
+        cancel = "$('[data-order=cancel]')"
         await tab.value(f"{cancel}.click()")
         assert await tab.value(f"{cancel}.textContent") == "Sure?"
         assert len({o.order for o in world.others.orders}) == 1
         await tab.value(f"{cancel}.click()")
         await eventually(lambda: world.others.orders[-1].action == a.CANCEL)
     world.say(p.CANCELLED)
-    await tab.until("document.getElementById('orders').hidden")
+    await tab.until("$('#orders').hidden")

@@ -13,7 +13,7 @@ from tests.actors.operator.world import SPEC, repeated
 pytestmark = pytest.mark.page
 
 
-WIDE = """[...document.querySelectorAll('main *')].filter((e) =>
+WIDE = """$$('main *').filter((e) =>
     e.getBoundingClientRect().right > 361 && !e.closest('.across, .scroll'))
     .map((e) => e.tagName + '#' + e.id + '.' + e.className).join()"""
 NAMELESS = """(() => {
@@ -23,7 +23,7 @@ NAMELESS = """(() => {
     || (e.labels && [...e.labels].some((l) => l.textContent.trim()))
     || (e.getAttribute('aria-labelledby') || '').split(' ').some(
       (id) => (document.getElementById(id) || {}).textContent);
-  for (const e of document.querySelectorAll(
+  for (const e of $$(
       'button, select, input, textarea, [role=img], [role=group], [role=application], section,'
       + ' progress, [tabindex="0"]')) {
     if (!seen(e)) continue;
@@ -32,17 +32,17 @@ NAMELESS = """(() => {
         ? e.getAttribute('aria-label') || e.getAttribute('aria-labelledby') : named(e);
     if (!own || !named(e) && !e.labels?.length) wrong.push(`no name: ${e.outerHTML.slice(0, 90)}`);
   }
-  for (const e of document.querySelectorAll('[aria-labelledby], [aria-describedby], [for]')) {
+  for (const e of $$('[aria-labelledby], [aria-describedby], [for]')) {
     for (const name of ['aria-labelledby', 'aria-describedby', 'for']) {
       for (const id of (e.getAttribute(name) || '').split(' ').filter(Boolean)) {
         if (!document.getElementById(id)) wrong.push(`${name} names nobody: ${id}`);
       }
     }
   }
-  const ids = [...document.querySelectorAll('[id]')].map((e) => e.id);
+  const ids = $$('[id]').map((e) => e.id);
   ids.filter((id, i) => ids.indexOf(id) !== i).forEach((id) => wrong.push(`twice: ${id}`));
-  for (const e of document.querySelectorAll('th')) if (!e.scope) wrong.push('th without scope');
-  for (const e of document.querySelectorAll('main *')) {
+  for (const e of $$('th')) if (!e.scope) wrong.push('th without scope');
+  for (const e of $$('main *')) {
     const style = getComputedStyle(e);
     if (seen(e) && /(auto|scroll)/.test(style.overflowX + style.overflowY)
         && (e.scrollHeight > e.clientHeight + 1 || e.scrollWidth > e.clientWidth + 1)
@@ -70,7 +70,7 @@ PALE = """(() => {
     }
     return [255, 255, 255];
   };
-  for (const e of document.querySelectorAll('body *:not(svg *)')) {
+  for (const e of $$('body *:not(svg *)')) {
     const text = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
     if (!text || !e.checkVisibility() || e.closest('.unseen, .skip, :disabled, option')) continue;
     const [a, b] = [light(rgb(getComputedStyle(e).color)), light(behind(e))];
@@ -83,7 +83,7 @@ PALE = """(() => {
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 async def test_everything_has_a_name_can_be_read_and_reached_and_fits_a_phone(world, tab, scheme):
-    busy = f"{events('active')} === 'FTM4' && document.querySelectorAll('#nodes tr').length > 0"
+    busy = f"{events('active')} === 'FTM4' && $$('#nodes tr').length > 0"
     async with page(world, tab, scheme=scheme) as hmi, repeated(world.others.busy):
         await tab.until(busy)
         assert await tab.value(NAMELESS) == ""
@@ -98,7 +98,7 @@ async def test_everything_has_a_name_can_be_read_and_reached_and_fits_a_phone(wo
 
 async def test_the_first_stop_of_the_keyboard_skips_to_the_map_and_nothing_has_to_move(world, tab):
     async with page(world, tab, motion="reduce"):
-        assert await tab.value("parseFloat(getComputedStyle(document.querySelector("
+        assert await tab.value("parseFloat(getComputedStyle($("
                                "'.event .box')).transitionDuration)") == 0
         for kind in ("rawKeyDown", "keyUp"):
             await tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
@@ -114,8 +114,8 @@ async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_miss
     async with world.running(plain), repeated(world.others.busy):
         await show(tab, plain)
         await tab.until(f"{events('active')} === 'FTM4'")
-        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
-        shown = await tab.value("[...document.querySelectorAll('.panel h2')]"
+        await tab.until("$$('#nodes tr').length > 0")
+        shown = await tab.value("$$('.panel h2')"
                                 ".filter((e) => e.checkVisibility()).map((e) => e.id).join()")
         assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "events-title",
                                     "order-title", "nodes-title", "fault-heading"]

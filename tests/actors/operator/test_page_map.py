@@ -14,12 +14,12 @@ from tests.actors.operator.world import repeated
 from tests.actors.osmosis.airport.large import WIDE_M, write_large_airport
 
 pytestmark = pytest.mark.page
-BOX = "document.getElementById('map').viewBox.baseVal"
+BOX = "$('#map').viewBox.baseVal"
 
 
 def size_px(selector: str) -> str:
     """Return an expression for the width on the screen of what a selector finds first."""
-    return f"document.querySelector({selector!r}).getBoundingClientRect().width"
+    return f"$({selector!r}).getBoundingClientRect().width"
 
 
 @pytest.fixture(scope="module")
@@ -38,25 +38,24 @@ async def test_an_airport_of_8_km_is_drawn_zoomed_and_moved_and_its_marks_keep_t
         world.others.publish(topics.MISSION_STATUS, mission)
 
     async with page(world, tab, airport=large), repeated(drive):
-        await tab.until("document.querySelectorAll('#map .goal').length > 3")
-        await tab.until("document.querySelector('.robot').getAttribute('visibility') === 'visible'")
+        await tab.until("$$('#map .goal').length > 3")
+        await tab.until("$('.robot').getAttribute('visibility') === 'visible'")
         assert await tab.value(f"{BOX}.width > {WIDE_M}") is True
-        assert await tab.value("document.querySelectorAll('#map .pavement').length") > 1000
+        assert await tab.value("$$('#map .pavement').length") > 1000
         ring, goal = size_px("#map .robot-ring"), size_px("#map .goal")
         sizes = [await tab.value(ring), await tab.value(goal)]
         assert 12 < min(sizes) <= max(sizes) < 80, sizes
-        await tab.value("document.getElementById('follow').click()")
+        await tab.value("$('#follow').click()")
         await tab.until(f"{BOX}.width < 30")
         assert await tab.value(ring) == pytest.approx(sizes[0], rel=0.05)
-        await tab.value("document.querySelector('[title=\"Show the whole map\"]').click()")
+        await tab.value("$('[title=\"Show the whole map\"]').click()")
         await tab.until(f"{BOX}.width > {WIDE_M}")
 
-        at = await tab.value("(() => { const r = document.getElementById('map')"
+        at = await tab.value("(() => { const r = $('#map')"
                              ".getBoundingClientRect(); return [r.x + r.width / 4,"
                              " r.y + r.height / 4]; })()")
         place = (f"(() => {{ const p = new DOMPoint({at[0]}, {at[1]}).matrixTransform("
-                 "document.getElementById('map').getScreenCTM().inverse());"
-                 " return [p.x, p.y]; })()")
+                 "$('#map').getScreenCTM().inverse()); return [p.x, p.y]; })()")
         before = await tab.value(place)
         await tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=at[0], y=at[1],
                        deltaX=0, deltaY=-1500)
@@ -71,11 +70,10 @@ async def test_an_airport_of_8_km_is_drawn_zoomed_and_moved_and_its_marks_keep_t
         assert await tab.value(f"{BOX}.width") == pytest.approx(width)
         for key, sign in (("+", "<"), ("-", ">")):
             now = await tab.value(f"{BOX}.width")
-            await tab.value("document.getElementById('map').dispatchEvent("
+            await tab.value("$('#map').dispatchEvent("
                             f"new KeyboardEvent('keydown', {{ key: '{key}' }}))")
             await tab.until(f"{BOX}.width {sign} {now}")
-        await tab.value("document.getElementById('map').dispatchEvent("
-                        "new KeyboardEvent('keydown', { key: '0' }))")
+        await tab.value("$('#map').dispatchEvent(new KeyboardEvent('keydown', { key: '0' }))")
         await tab.until(f"{BOX}.width > {WIDE_M}")
 
 

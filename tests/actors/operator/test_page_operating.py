@@ -24,9 +24,9 @@ from tests.osmosis_system import shipped_system
 
 pytestmark = pytest.mark.page
 
-FREE = "document.querySelector('.stick-state').textContent === 'free'"
-WORDS = "document.querySelector('.stick-text').textContent"
-PAD = "document.querySelector('.stick')"
+FREE = "$('.stick-state').textContent === 'free'"
+WORDS = "$('.stick-text').textContent"
+PAD = "$('.stick')"
 
 
 def alive(world: World):
@@ -73,7 +73,7 @@ async def drives(tab, world, **position: float) -> None:
     """Wait until the robot is told to drive like this."""
     wanted = m.Joystick(position.get("forward", 0.0), position.get("left", 0.0), dead_man=True)
     await eventually(lambda: bool(world.others.stick) and world.others.stick[-1] == wanted)
-    await tab.until("document.querySelector('.stick-state').textContent === 'you drive'")
+    await tab.until("$('.stick-state').textContent === 'you drive'")
 
 
 async def drive_ahead(tab, world) -> None:
@@ -109,8 +109,7 @@ async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops
 
     for lost in (f"{PAD}.blur()", "dispatchEvent(new Event('blur'))",
                  "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
-                 "document.dispatchEvent(new Event('visibilitychange'));"
-                 "delete document.hidden"):
+                 "document.dispatchEvent(new Event('visibilitychange'));delete document.hidden"):
         await tab.value(f"{PAD}.focus()")
         await key(tab, "ArrowDown", down=True)
         await drives(tab, world, forward=-0.5)
@@ -141,7 +140,7 @@ async def test_the_page_says_why_teleoperation_does_not_follow_it(world, tab):
     await drive_ahead(tab, world)
     world.others.publish(bus_topics.DIAGNOSTIC, bm.Diagnostic(
         "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
-    await tab.until("document.querySelector('.stick-state').textContent === 'not followed'")
+    await tab.until("$('.stick-state').textContent === 'not followed'")
     assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
     await key(tab, "w", down=False)
     await stops(world)
@@ -192,7 +191,7 @@ async def test_an_hmi_that_comes_back_is_not_driven_by_a_key_that_is_still_held(
 @pytest.mark.usefixtures("patient")
 async def test_the_stick_on_the_screen_and_a_gamepad_drive(world, tab):
     await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
-    await tab.value("document.querySelector('.stick-words input').value = 100")
+    await tab.value("$('.stick-words input').value = 100")
     x, y, radius = await hand_on_the_pad(tab)
     await mouse(tab, "mousePressed", x, y)
     await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
@@ -230,49 +229,42 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, tab,
 
     monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
 
-    row = "document.querySelector('tr[data-node=osmosis_control]')"
-    confirm = "document.getElementById('signal-confirm')"
+    row = "$('tr[data-node=osmosis_control]')"
+    confirm = "$('#signal-confirm')"
     node = fm.NodeInfo("osmosis_control", "control", 77, fm.NodeState.RUNNING, 1, 0)
     async with repeated(lambda: world.others.publish(ftm_topics.NODES, fm.NodeTable((node,)))):
         await tab.until(f"{row} !== null")
         await tab.value(f"{row}.querySelector('button').click()")
         assert await tab.value(f"{confirm}.hidden") is True
-        await tab.value("[...document.querySelectorAll('#signals button')].find("
-                        "(b) => b.textContent === 'KILL').click()")
+        await tab.value("$$('#signals button').find((b) => b.textContent === 'KILL').click()")
         assert await tab.value(f"{confirm}.textContent") == "Send KILL to osmosis_control"
         assert sent == []
         await tab.value(f"{confirm}.click()")
         await eventually(lambda: sent == [("osmosis_control", "KILL")])
-        await tab.until("document.getElementById('toast').textContent"
-                        " === 'osmosis_control (pid 77): KILL'")
+        await tab.until("$('#toast').textContent === 'osmosis_control (pid 77): KILL'")
 
 
 @pytest.mark.parametrize("hmi", [{"faults": OsmosisFaults().offered(),
                                   "system": shipped_system()}], indirect=True)
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world, tab):
-    await tab.until("!document.getElementById('strategy-set').disabled")
-    assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"
-    await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
-                    "document.getElementById('strategy-set').click()")
+    await tab.until("!$('#strategy-set').disabled")
+    assert await tab.value("$('#strategy-name').value") == "safety-first"
+    await tab.value("$('#strategy-name').value = 'mission-first';$('#strategy-set').click()")
     await eventually(lambda: bool(world.others.adaptations))
     world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
         world.others.adaptations[0].request, True, "", 1))
-    await tab.until("document.getElementById('toast').textContent"
+    await tab.until("$('#toast').textContent"
                     " === 'strategy mission-first is in force, change 1 of the run'")
 
-    submit = "document.getElementById('inject').requestSubmit()"
+    submit = "$('#inject').requestSubmit()"
     for chosen, topic in (("gps-bias", "summit_xl/gps"), ("freeze:", "plan/route")):
         await tab.value(
-            f"document.getElementById('fault').value = '{chosen}';"
-            "document.getElementById('fault').dispatchEvent(new Event('change'));"
-            "document.getElementById('fault-topic').value = 'plan/route';"
-            f"document.getElementById('fault-duration').value = '4'; {submit}")
+            f"$('#fault').value = '{chosen}';$('#fault').dispatchEvent(new Event('change'));"
+            f"$('#fault-topic').value = 'plan/route';$('#fault-duration').value = '4'; {submit}")
         await eventually(lambda topic=topic: any(o.topic == topic for o in world.others.injections))
         order = next(o for o in world.others.injections if o.topic == topic)
         assert order.duration_s == 4.0
         world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
             order.injection, "simulator", 12, True, ""))
-        await tab.until("document.querySelector('#faults li').textContent"
-                        f".startsWith('{chosen}')")
-        await tab.until("document.querySelector('#faults li').textContent"
-                        ".includes('over, 12 messages changed')")
+        await tab.until(f"$('#faults li').textContent.startsWith('{chosen}')")
+        await tab.until("$('#faults li').textContent.includes('over, 12 messages changed')")

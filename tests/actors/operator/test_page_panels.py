@@ -19,9 +19,9 @@ pytestmark = pytest.mark.page
 SHOWN = (*PANELS[:2], Panel(title="Pump", states="tank/pump:phase", of=("idle", "filling")),
          *PANELS[3:], Panel(title="Where", map=("tank/level:height_m", "tank/level:heading_rad",
                                                 "tank/level:heading_rad")))
-BODY = "document.querySelector('[data-name=\"{}\"] .inside')"
+BODY = "$('[data-name=\"{}\"] .inside')"
 DRAWN = """(() => {  // width of what a plot shows, pixels
-  const canvas = document.querySelector('.plot canvas');
+  const canvas = $('.plot canvas');
   if (!canvas) return 0;
   const { width, height } = canvas;
   const copy = new OffscreenCanvas(width, height).getContext('2d', { willReadFrequently: true });
@@ -33,10 +33,9 @@ DRAWN = """(() => {  // width of what a plot shows, pixels
   });
   return [...Array(width).keys()].filter(blue).length;
 })()"""
-NAMES = ("[...document.querySelectorAll('main > .panel')].filter((p) => !p.hidden)"
-         ".map((p) => p.dataset.name)")
+NAMES = ("$$('main > .panel').filter((p) => !p.hidden).map((p) => p.dataset.name)")
 OVERLAPS = """(() => {
-  const boxes = [...document.querySelectorAll('main > .panel')].filter((p) => !p.hidden)
+  const boxes = $$('main > .panel').filter((p) => !p.hidden)
     .map((p) => p.getBoundingClientRect());
   const found = [];
   for (let i = 0; i < boxes.length; i += 1) for (let j = 0; j < i; j += 1) {
@@ -44,7 +43,7 @@ OVERLAPS = """(() => {
     if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1
         && b.top < a.bottom - 1) found.push(`${i} lies on ${j}`);
   }
-  for (const p of document.querySelectorAll('main > .panel:not([hidden])')) {
+  for (const p of $$('main > .panel:not([hidden])')) {
     if (p.scrollWidth > p.clientWidth) found.push(`${p.dataset.name} overflows`);
   }
   if (document.documentElement.scrollWidth > innerWidth) found.push('the window is too narrow');
@@ -85,7 +84,7 @@ async def test_each_panel_shows_its_fields_their_past_and_whether_they_are_heard
             await tab.until(f"{text('Where')}.includes('x 0.25 m, y 0.50 m, heading 29°')")
             width = f"{BODY.format('Where')}.querySelector('svg').viewBox.baseVal.width"
             whole = await tab.value(width)
-            zoom = "document.querySelector('[data-name=Where] [title=\"Zoom in\"]')"
+            zoom = "$('[data-name=Where] [title=\"Zoom in\"]')"
             await tab.value(f"{zoom}.click()")
             await tab.until(f"{width} < {whole}")
             height = 0.75
@@ -110,35 +109,35 @@ async def test_no_panel_lies_on_another_or_is_too_narrow(world, tab, of_the_robo
     async with shown, repeated(world.others.busy):
         for width, height in ((1920, 1080), (1366, 768), *([] if of_the_robot else [(1100, 700)])):
             await tab.show(await tab.value("location.href"), width=width, height=height)
-            await tab.until(f"{LIVE} && document.querySelectorAll('#nodes tr').length > 0")
+            await tab.until(f"{LIVE} && $$('#nodes tr').length > 0")
             await tab.until(f"{OVERLAPS} === ''", 5)
             if of_the_robot:
-                end = "document.getElementById('tree').getBoundingClientRect().bottom"
+                end = "$('#tree').getBoundingClientRect().bottom"
                 assert await tab.value(end) < height or height < 1080  # above the fold
                 continue
-            await tab.value("document.querySelector('.panel summary').click()")
+            await tab.value("$('.panel summary').click()")
             await tab.until(f"{OVERLAPS} === ''", 5)
-            await tab.value("document.getElementById('arrange-reset').click()")
+            await tab.value("$('#arrange-reset').click()")
 
 
 async def test_a_panel_is_moved_by_keyboard_and_mouse_and_folded_and_the_page_remembers(world, tab):
     async with tank(world, tab, width=1920, height=1080):
         before = await tab.value(NAMES)
         assert before[:3] == ["Level", "Over time", "Pump"]
-        await tab.value("document.querySelector('[data-name=\"Pump\"] .tool').focus()")
+        await tab.value("$('[data-name=\"Pump\"] .tool').focus()")
         for name, place in (("ArrowUp", 2), ("ArrowLeft", 1)):
             for kind in ("rawKeyDown", "keyUp"):
                 await tab.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
-            assert await tab.value("document.getElementById('arrange-said').textContent") == (
+            assert await tab.value("$('#arrange-said').textContent") == (
                 f"Pump: place {place} of {len(before)}")
         assert (await tab.value(NAMES))[:3] == ["Pump", "Level", "Over time"]
         focus = "document.activeElement.closest('.panel').dataset.name"
         assert await tab.value(focus) == "Pump"
-        await tab.value("document.querySelector('[data-name=\"Level\"] summary').click()")
+        await tab.value("$('[data-name=\"Level\"] summary').click()")
         await tab.until("JSON.stringify(localStorage).includes('folded\\\\\":[\\\\\"Level')")
         await tab.call("Page.reload")
         await tab.until(f"{LIVE} && {NAMES}[0] === 'Pump'")
-        folded = "document.querySelector('[data-name=\"Level\"]').open"
+        folded = "$('[data-name=\"Level\"]').open"
         assert await tab.value(folded) is False
         key = await tab.value("Object.keys(localStorage)[0]")
         for kept in ("{", '{"order": 3, "folded": {}}',  # nonsense in its memory does no harm
@@ -149,11 +148,11 @@ async def test_a_panel_is_moved_by_keyboard_and_mouse_and_folded_and_the_page_re
             await tab.until(f"window.before === undefined && {LIVE}"
                             f" && {NAMES}.length === {len(before)}")
             assert sorted(await tab.value(NAMES)) == sorted(before)
-        await tab.value("document.getElementById('arrange-reset').click()")
+        await tab.value("$('#arrange-reset').click()")
         assert await tab.value(NAMES) == before
         assert await tab.value(folded) is True
         await tab.until(f"{OVERLAPS} === ''", 5)
-        at = ("JSON.stringify((() => {{ const b = document.querySelector('[data-name=\"{}\"] {}')"
+        at = ("JSON.stringify((() => {{ const b = $('[data-name=\"{}\"] {}')"
               ".getBoundingClientRect(); return [b.left + b.width / 2, b.top + 8]; }})())")
         fro = json.loads(await tab.value(at.format("Level", ".tool")))
         to = json.loads(await tab.value(at.format("Pump", "h2")))
@@ -167,10 +166,10 @@ async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_
         await tab.until(f"{OVERLAPS} === ''", 5)
         below = await tab.value(
             "(() => { const top = (p) => p.getBoundingClientRect();"
-            " const level = top(document.querySelector('[data-name=Level]'));"
-            " return [...document.querySelectorAll('main > .panel')].find((p) => !p.hidden"
+            " const level = top($('[data-name=Level]'));"
+            " return $$('main > .panel').find((p) => !p.hidden"
             " && top(p).left === level.left && top(p).top > level.top).dataset.name; })()")
-        fold = f"document.querySelector('[data-name=\"{below}\"] summary')"
+        fold = f"$('[data-name=\"{below}\"] summary')"
         where = (f"JSON.stringify((() => {{ const b = {fold}.getBoundingClientRect();"
                  " return [b.left + b.width / 2, b.top + b.height / 2]; })())")
         frames = ("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame("

@@ -17,7 +17,7 @@ LIFT = Panel(title="Lift", stick=("tank/level:height_m",), scale=(3.0,))
 
 
 def of(panel: str, part: str) -> str:
-    return f"document.querySelector('[data-name=\"{panel}\"] {part}')"
+    return f"$('[data-name=\"{panel}\"] {part}')"
 
 
 def state(panel: str = "Drive") -> str:

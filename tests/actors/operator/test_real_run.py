@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.processes, pytest.mark.alone]
 TOKEN = "secret-of-the-hangar-7"
 
 
-ROW = "document.querySelector('tr[data-node=localization]')"
-STICK = "document.querySelector('.stick-state').textContent"
+ROW = "$('tr[data-node=localization]')"
+STICK = "$('.stick-state').textContent"
 STATE = f"(({ROW}) || document.createElement('p')).textContent"
 
 
@@ -43,11 +43,11 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
             await tab.until(f"{STICK} === 'free'", 60)
             run.wait_for(f"Operator's page: http://127.0.0.1:{port}/")
             assert await tab.value(f"{text('mission-phase')}") == "idle"
-            await tab.until("document.getElementById('mission-name').value === 'SHORT'")
-            await tab.value("document.getElementById('start').requestSubmit()")
+            await tab.until("$('#mission-name').value === 'SHORT'")
+            await tab.value("$('#start').requestSubmit()")
             await tab.until(f"{text('mission-phase')} === 'running'")
 
-            await tab.value("document.querySelector('.stick').focus()")
+            await tab.value("$('.stick').focus()")
             await key(tab, "ArrowUp", down=True)
             await tab.until(f"{text('pilot-reason')}.includes('the joystick pre-empts')")
             await key(tab, "ArrowUp", down=False)
@@ -59,15 +59,14 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
             assert run.pid("localization") not in (None, before)
             await tab.until(f"{STATE}.includes('running')")
 
-            await tab.value("document.getElementById('fault').value = 'duplicate:';"
-                            "document.getElementById('fault-topic').value = 'detection/DM1';"
-                            "document.getElementById('fault-duration').value = '1';"
-                            "document.getElementById('inject').requestSubmit()")
+            await tab.value("$('#fault').value = 'duplicate:';"
+                            "$('#fault-topic').value = 'detection/DM1';"
+                            "$('#fault-duration').value = '1';$('#inject').requestSubmit()")
             await tab.until(f"/duplicate:detection.DM1: over, \\d+ messages changed/.test("
                             f"{text('faults')})")
 
-            await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
-                            "document.getElementById('strategy-set').click()")
+            await tab.value("$('#strategy-name').value = 'mission-first';"
+                            "$('#strategy-set').click()")
             await tab.until(f"{text('strategy-now')} === 'in force: mission-first'")
 
             before = run.pid("hmi")
@@ -91,10 +90,8 @@ def short(tmp_path) -> str:
 
 
 async def kill(tab, node: str) -> None:
-    await tab.value(f"document.querySelector('tr[data-node={node}] button').click();"
-                    "[...document.querySelectorAll('#signals button')]"
-                    ".find((b) => b.textContent === 'KILL').click();"
-                    "document.getElementById('signal-confirm').click()")
+    await tab.value(f"$('tr[data-node={node}] button').click();$$('#signals button')"
+                    ".find((b) => b.textContent === 'KILL').click();$('#signal-confirm').click()")
 
 
 ELSEWHERE = ["--hmi-host", "0.0.0.0"]
