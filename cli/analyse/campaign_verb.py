@@ -43,15 +43,10 @@ from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.defaults import PATIENCE_S
 from rampart.sim.campaign.execute import JobError, execute
-from rampart.sim.campaign.job import (
-    Job,
-    RunResult,
-    run_virtually,
-    virtual_run,
-)
+from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
+from rampart.sim.campaign.report import Campaign, write_campaign_report
 from rampart.sim.campaign.statistics import (
     Rate,
     Row,
@@ -372,8 +367,7 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
         title=named.title if named else "Fault-injection campaign", seed=options.seed,
         command=f"rampart {shlex.join(sys.argv[1:])}",
         section=named.section(spec, runs) if named else None)
-    worst = {run.job.key: run_virtually(run.job) for run in worth_showing(runs)}
-    return write_campaign_report(directory, about, runs, worst)
+    return write_campaign_report(directory, about, runs)
 
 
 # -- showing -----------------------------------------------------------------------------------

@@ -97,6 +97,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         margins: See `Judgement`, as the next two.
         severity: How unsafe it was.
         unsafe_s: When it first became unsafe.
+        narrowest_s: When the smallest margin was measured.
         injected_s: When the first effective fault was injected.
         detected_after_s: Time from then to the first detection.
         detected_by: Detection modules that have detected something since, the first one first.
@@ -130,6 +131,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     judged: bool = True
     restarts: int = 0
     detected_by: tuple[str, ...] = ()
+    narrowest_s: float | None = None
 
     @property
     def stopped_for_good(self) -> bool:
@@ -168,7 +170,7 @@ def run_job(job: Job) -> RunResult:
         judged=record.mission is not None, restarts=sum(record.restarts.values()),
         reasons=record.reasons,
         duration_s=round(record.duration_s, 2), margins=judged.margins, severity=judged.severity,
-        unsafe_s=judged.unsafe_s,
+        unsafe_s=judged.unsafe_s, narrowest_s=judged.narrowest_s,
         injected_s=injected_s, **latencies(record, injected_s),
         decisions=tuple(DecisionTaken(round(d.t_s, 3), d.active, d.recoveries)
                         for d in record.decisions),

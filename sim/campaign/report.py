@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.files.writing import replace_file
-from rampart.sim.campaign.job import trial_of_system
+from rampart.sim.campaign.job import RunResult, trial_of_system
 from rampart.sim.campaign.named import Section
 from rampart.sim.campaign.statistics import (
     Condition,
@@ -37,15 +37,16 @@ from rampart.sim.campaign.statistics import (
     total,
 )
 from rampart.sim.campaign.store import Run
-from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.report import NONE, Moment, environment, margin_text
+from rampart.sim.runs.report import NONE, environment, margin_text
 from rampart.sim.runs.trial import Trial
-from rampart.sim.runs.virtual_run import VirtualResult
 
 FILE_NAME = "report.html"
 
 SHOWN_AT_ONCE = 12
 """Faults of a kind that are shown; the others are folded."""
+
+DECISIONS = 8
+"""Most decisions that are shown of a run."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +66,13 @@ class Campaign:
     section: Section | None = None
 
 
-def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
-                          worst: Mapping[str, VirtualResult] = {}) -> Path:
+def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run]) -> Path:
     """Write `report.html` into the campaign's directory, atomically.
 
     Args:
         directory: Of the campaign, as the user names it; made if necessary.
         about: The campaign.
         runs: All runs, of one system.
-        worst: Repeated runs to be shown one by one, by key, see `worth_showing`.
 
     Returns:
         The path of the page.
@@ -83,29 +82,22 @@ def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
     """
     directory.mkdir(parents=True, exist_ok=True)
     page = directory / FILE_NAME
-    replace_file(page, render(directory, about, runs, worst).encode(), 0o644)
+    replace_file(page, render(directory, about, runs).encode(), 0o644)
     return page
 
 
-def render(directory: Path, about: Campaign, runs: Sequence[Run],
-           worst: Mapping[str, VirtualResult] = {}) -> str:
+def render(directory: Path, about: Campaign, runs: Sequence[Run]) -> str:
     """Return the HTML page; arguments as for `write_campaign_report`."""
     found = conditions(runs)
     trial = trial_of_system(runs[0].job.system) if runs else Trial
-    by_key = {run.job.key: run for run in runs}
-    shown_runs = [(by_key[key], made) for key, made in worst.items() if key in by_key]
+    worst = worth_showing(runs)
     texts = {run.job.key: condition.text for condition in found for run in condition.runs}
     pages = environment()
     pages.filters["breakable"] = _breakable
-    shown = {run.job.key for run, _ in shown_runs}
+    shown = {run.job.key for run in worst}
 
     def replay(key: str) -> str:
         return shlex.join(["rampart", "campaign", "--replay", key, "--out", str(directory)])
-
-    def shown_run(run: Run, made: VirtualResult) -> dict[str, Any]:
-        chapter = story(run, made.record, made.judgement.narrowest_s)
-        return {"condition": texts[run.job.key], "command": replay(run.job.key),
-                "margin": _margin(run.result.margin, trial), **chapter}
 
     return pages.get_template("campaign/report.html").render(
         about=about, runs=runs, headline=headline(runs), in_common=in_common(runs),
@@ -113,7 +105,8 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
         sentence=about.section and about.section.sentence,
         summary=[(each, _summary(each, trial)) for each in found],
         every=_every_fault(found, trial), shown_at_once=SHOWN_AT_ONCE,
-        tracks=[shown_run(*each) for each in shown_runs], shown=shown,
+        worst=[(run, texts[run.job.key], kind_of(run.job), _margin(run.result.margin, trial),
+                moments(run.result)) for run in worst], shown=shown, most=DECISIONS,
         failures=[(run.job.key, text) for run in runs for text in run.result.failures],
         replay=replay, margins=list(trial.margins.values()), exact_below=trial.exact_below,
         unit=trial.margin_unit, none=NONE)
@@ -250,9 +243,6 @@ def _margin(value: float | None, trial: type[Trial]) -> str:
     return margin_text(value, trial.margin_unit, trial.exact_below)
 
 
-_DECISIONS = 8
-
-
 def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
     """Return the worst runs, worst first, each with another fault.
 
@@ -273,29 +263,18 @@ def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
     return sorted([*protected[:most - len(bare)], *bare], key=_rank, reverse=True)
 
 
-def story(run: Run, record: RunRecord, narrowest_s: float | None) -> dict[str, Any]:
-    """Return the events of one of the worst runs, for the page.
-
-    Args:
-        run: Of the campaign.
-        record: Of the repeated run.
-        narrowest_s: When the smallest margin was measured.
-    """
-    result = run.result
+def moments(result: RunResult) -> list[tuple[float, str]]:
+    """Return the events of a run in their order: simulated seconds, and a text."""
     detected_s = (None if result.injected_s is None or result.detected_after_s is None
                   else result.injected_s + result.detected_after_s)
-    marks = [Moment(at_s, kind, name) for kind, name, at_s in (
-        ("end", "end of the run", result.duration_s),
-        ("fault", "fault injected", result.injected_s),
-        ("detected", "first detection", detected_s),
-        ("narrow", "smallest margin", narrowest_s if result.safe else None),
-        ("unsafe", "first unsafe", result.unsafe_s)) if at_s is not None]
-    return {
-        "key": run.job.key, "fault": run.job.text(), "run": run, "kind": kind_of(run.job),
-        "moments": sorted([*marks, *(Moment(d.t_s, "", d.words)
-                                     for d in record.decisions[:_DECISIONS])]),
-        "more": max(0, len(record.decisions) - _DECISIONS),
-    }
+    marks = [(at_s, name) for name, at_s in (
+        ("fault injected", result.injected_s), ("first detection", detected_s),
+        ("smallest margin", result.narrowest_s if result.safe else None),
+        ("first unsafe", result.unsafe_s), ("end of the run", result.duration_s))
+        if at_s is not None]
+    return sorted([*marks, *(
+        (d.t_s, f"{', '.join(d.active) or 'nothing'}: {', '.join(d.recoveries) or 'no recovery'}")
+        for d in result.decisions[:DECISIONS])])
 
 
 def _rank(run: Run) -> tuple[bool, tuple[bool, bool, float]]:

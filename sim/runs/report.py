@@ -171,14 +171,3 @@ def ticks_of(duration_s: float) -> list[dict[str, Any]]:
     step_s = next((t for t in _TICKS if duration_s / t <= 10), 7200)
     return [{"left": round(100 * i * step_s / duration_s, 3), "text": clock(i * step_s)[:-2]}
             for i in range(int(duration_s // step_s) + 1)]
-
-
-class Moment(NamedTuple):
-    """An event at `at_s`, simulated seconds; the kind chooses its symbol.
-
-    Kinds: fault, detected, narrow (the smallest margin), unsafe, end; "" without a symbol.
-    """
-
-    at_s: float
-    kind: str
-    name: str

@@ -374,7 +374,6 @@ def made_up(monkeypatch):
         return len(jobs)
 
     monkeypatch.setattr(campaign_verb, "execute", fake)
-    monkeypatch.setattr(campaign_verb, "worth_showing", lambda _runs: [])
     return bad
 
 
