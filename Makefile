@@ -55,21 +55,20 @@ ros-wheels: .venv-ros/installed
 	.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r $<
 	@touch $@
 
-# Hits every process of the full system in every way in one mission, then 50 routers, with a count of
-# what leaks; a quarter of an hour.
+# Hits every process of the full system in every way; a quarter of an hour. Interrupted, it goes on
+# where it was, as do the other two: reports/ways.jsonl says what is done.
 chaos: setup
-	$(BIN)/python -m tests.whole.chaos_runs ways
+	$(BIN)/python -m tests.whole.chaos ways
 
 # Hits every pair of processes of the full system, one after the other in long missions; an hour or
-# more. Interrupted, it goes on where it was: reports/pairs.jsonl says what is done.
+# more.
 chaos-pairs: setup
-	$(BIN)/python -m tests.whole.chaos_runs pairs
+	$(BIN)/python -m tests.whole.chaos pairs
 
 # Missions without end, a random fault every five seconds, for so many hours; figures at the end.
-# Interrupted, it goes on where it was: the same command.
 HOURS ?= 1
 soak: setup
-	$(BIN)/python -m tests.whole.chaos_runs soak --hours $(HOURS)
+	$(BIN)/python -m tests.whole.chaos soak --hours $(HOURS)
 
 # 10,000 generated inputs for each decoder, and a fifth as many series of messages for each actor.
 # RUNS=1000000 makes more, FUZZ="-k '[system]'" chooses a target.

@@ -1,35 +1,65 @@
-"""Chaos: hits processes of a running system, and checks that each of them comes back.
+"""Chaos on real processes: `make chaos`, `make chaos-pairs` and `make soak`; some of it in tests.
 
-A plan is pure and seeded: which processes are hit, how, and how long after the strike before.
-`Chaos` carries strikes out one by one, and waits each time until every victim is gone and another
-process has taken its place. If asked, it also waits until the whole system is back: the
-supervisor's table has all nodes running in the processes that /proc shows, with a heartbeat since
-the repair.
+    python -m tests.whole.chaos ways|pairs|soak [--seed N] [--rate R] [--file FILE] [--hours H]
 
-Two processes are only stopped for a moment (`PAUSE`):
+ways     every process in every way
+pairs    every pair of processes at once; those with the supervisor or the root in all combinations
+soak     missions without end, a random fault every five seconds
 
-* The root, whose end is the run's. `test_launch.py` checks that nothing is left behind then.
+A plan is pure and seeded: which processes are hit, how, and when. `Chaos` carries it out during a
+mission. After each strike it waits until every victim is gone and another process has taken its
+place; in pairs the whole system has to be back, too: the supervisor's table has all nodes running
+in the processes that /proc shows, with a heartbeat since the repair. An emergency stop that latches
+is reset. Two processes are only stopped for a moment (`PAUSE`):
+
+* The root, whose end is the run's. `test_supervision.py` checks that nothing is left behind then.
 * The world. It stands for the real one, ground truth included, and is not restarted.
 
 A process of the pool is no node: any other one of the pool counts as its replacement.
+
+One line is printed for each strike or mission, and a summary. Exit code 1 if anything was not as it
+has to be: that ends a session. What is done is kept as lines of JSON, and the same command
+continues after an interruption. Other load on the machine is part of what is tested, so keep it
+moderate.
+
+In the soak each process is killed once at first: a process of the pool that has replaced another
+has more memory of its own than those that were forked at the start, and after that step it counts
+whether memory grows. Then half of the faults hit a process, from outside. The other half are those
+of messages, sensors, actuators and the world that the run's injector knows; each is over when the
+next one comes. A mission of the soak that fails and is safe is counted.
+
+A figure grows if the line through it rises by more per hour than what counts, and what it rises by
+is more than chance (a correlation above `CLEAR`). Samples of one mission have a level of their own,
+so each is compared with the mean of its mission. The first five minutes of a mission are left out:
+processes begin as copies of the root, and what they share with it becomes their own as they touch
+it.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import os
 import random
 import re
+import shutil
 import signal
+import statistics
+import subprocess
+import sys
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.runtime.checkpoint_file import read
@@ -39,9 +69,14 @@ from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.root import POOL
 from rampart.manager.spec.schema import Kind, SystemSpec
-from rampart.testing import RealRun
+from rampart.manager.spec.specification import parse_specification
+from rampart.sim.campaign.plan import fault_groups
+from rampart.sim.faults.scenario import PlannedFault
+from rampart.testing import RealRun, free_base_port
+from tests import ROOT
 from tests.real_tools import printed
 
+SYSTEM = ROOT / "systems" / "osmosis.toml"
 ROOT_PROCESS = "root"
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
 PAUSE = "PAUSE"
@@ -56,10 +91,30 @@ ROOT_PAUSE_S = (0.3, 1.5)
 GAP_S = 0.4
 """The second of a pair is hit at once, or up to so many wall seconds later."""
 
+BREATH_S = 0.3
+"""Wall seconds between everything being back and the next strike."""
+
+FIRST_S, EVERY_S, LASTS_S = 10.0, 5.0, (0.5, 4.0)
+"""Simulated seconds before a mission's first fault, between two, and of one of the injector."""
+
+LONGEST_S = 3600.0
+"""Simulated seconds of a mission for which faults are planned."""
+
+MISSION_S, END_WITHIN_S = 1200.0, 60.0
+SAMPLE_S = 10.0
+WARM_UP_S = 300.0
+FIGURES = ("MB", "descriptors", "threads")
+COUNTS = {"all": (30.0, 60.0, 20.0), ROOT_PROCESS: (15.0, 6.0, 2.0)}
+ONE = (5.0, 6.0, 2.0)
+"""How much in an hour counts: of all together, of the root, and of any other process."""
+
+CLEAR = 0.5
 EMERGENCY_STOP = "RM1"
 
 _ENDED = re.compile(r"\] mission \S+ (succeeded|failed|cancelled)")
 _DECISION = re.compile(r"\] decision \d+: (.*)")
+
+Record = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +128,10 @@ class Hit:
 
 @dataclass(frozen=True, slots=True)
 class Strike:
-    """Processes that are hit, `gap_s` wall seconds apart, `after_s` after the last repair."""
+    """Processes that are hit, `gap_s` wall seconds apart, not before a simulated second."""
 
     hits: tuple[Hit, ...]
-    after_s: float = 0.0
+    at_s: float = 0.0
     gap_s: float = 0.0
 
     @property
@@ -104,6 +159,11 @@ class Targets:
         return Hit(name, dice.choice(ways))
 
 
+def load() -> SystemSpec:
+    """Return the full system."""
+    return parse_specification(SYSTEM.read_text(encoding="utf-8"), SYSTEM.name)
+
+
 def targets(spec: SystemSpec) -> Targets:
     """Return the processes of a system, one name for each, and those that every system has."""
     nodes = [members[0] for members in spec.processes().values()]
@@ -112,7 +172,7 @@ def targets(spec: SystemSpec) -> Targets:
     return Targets((*mortal, SUPERVISOR, *ROUTERS, POOL), (*world, ROOT_PROCESS))
 
 
-def each_in_every_way(of: Targets, seed: int, after_s: tuple[float, float]) -> list[Strike]:
+def each_in_every_way(of: Targets, seed: int, every_s: float = 4.0) -> list[Strike]:
     """Return four rounds in which every process is hit, each time in another way.
 
     No process is hit twice in succession.
@@ -125,7 +185,7 @@ def each_in_every_way(of: Targets, seed: int, after_s: tuple[float, float]) -> l
         if strikes and (names[0],) == strikes[-1].names:
             names.reverse()
         strikes += [Strike((of.hit(dice, name, ways.get(name, WAYS)[i:i + 1]),),
-                           dice.uniform(*after_s)) for name in names]
+                           every_s * (len(strikes) + place)) for place, name in enumerate(names)]
     return strikes
 
 
@@ -150,6 +210,27 @@ def every_pair(of: Targets, seed: int) -> list[Strike]:
             drawn.append(Strike(tuple(hits), gap_s=gap_s))
     dice.shuffle(drawn)
     return drawn
+
+
+def of_a_soak(spec: SystemSpec, seed: int, mission: int) -> tuple[list[Strike], list[PlannedFault]]:
+    """Return what hits the processes of a mission, and the faults of the injector."""
+    dice = random.Random(f"soak {seed} {mission}")
+    of = targets(spec)
+    groups = {kind: names for kind, names in fault_groups(spec).items()
+              if kind != "process" and names}
+    strikes, faults = [], []
+    first = dice.sample(of.mortal, len(of.mortal))
+    for i in range(int((LONGEST_S - FIRST_S) / EVERY_S)):
+        at_s = FIRST_S + i * EVERY_S
+        if i < len(first):
+            strikes.append(Strike((Hit(first[i], "KILL"),), at_s))
+        elif dice.random() < 0.5:
+            strikes.append(Strike((of.hit(dice, dice.choice((*of.mortal, *of.paused))),), at_s))
+        else:
+            names = groups[dice.choice(list(groups))]
+            faults.append(PlannedFault(dice.choice(names), at_s,
+                                       duration_s=round(dice.uniform(*LASTS_S), 2)))
+    return strikes, faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,82 +260,80 @@ class Chaos:
     Args:
         run: The run.
         report: Is called with each strike that was carried out.
+        everything: Whether the whole system has to be back, and not only the victims.
+        until_s: When to stop, on the monotonic clock.
 
     Attributes:
         struck: What was carried out.
         resets: Emergency stops that were released.
+        now_s: Simulated seconds.
     """
 
-    def __init__(self, run: RealRun, report: Callable[[Struck], object] = lambda _: None) -> None:
+    def __init__(self, run: RealRun, report: Callable[[Struck], object] = lambda _: None, *,
+                 everything: bool = False, until_s: float = float("inf")) -> None:
         self.struck: list[Struck] = []
         self.resets = 0
-        self._run = run
-        self._report = report
-        info = run.info
-        self._rate = info.rate
-        self._clock = Clock(info.origin_s, info.rate)
+        self._run, self._report = run, report
+        self._everything, self._until_s = everything, until_s
+        self._rate = run.info.rate
+        self.now_s = Clock(run.info.origin_s, self._rate).now
         self._read = 0
-        self._has_ended = False
+        self._is_over = False
         self._decided = ""
 
-    def carry_out(self, strikes: Iterable[Strike]) -> list[Strike]:
-        """Strike while the run lasts; return what was left to be done."""
+    def carry_out(self, strikes: Iterable[Strike],
+                  meanwhile: Callable[[], object] = lambda: None) -> list[Strike]:
+        """Strike while the mission lasts; return what was left to be done."""
         strikes = list(strikes)
         for i, strike in enumerate(strikes):
-            until = time.monotonic() + strike.after_s
-            while time.monotonic() < until and not self.over():
+            while self.now_s() < strike.at_s and not self.over():
+                meanwhile()
                 time.sleep(0.02)
-            if self.over() or self.strike(strike) is None:
+            self._release()
+            if self.over() or not self._strike(strike):
                 return strikes[i:]
+            time.sleep(BREATH_S)
         return []
 
-    def strike(self, strike: Strike, *, everything: bool = False) -> Struck | None:
-        """Hit, and wait for the repair; return None if the run was over first.
+    def over(self) -> bool:
+        """Return whether the mission has ended, or the run, or the time for it; or is unsafe."""
+        new = self._run.story_from(self._read)
+        whole = new[:new.rfind("\n") + 1]
+        self._read += len(whole.encode())
+        for decision in _DECISION.finditer(whole):
+            self._decided = decision[1]
+        self._is_over = (self._is_over or _ENDED.search(whole) is not None or "UNSAFE" in whole
+                         or self._run.process.poll() is not None
+                         or time.monotonic() >= self._until_s)
+        return self._is_over
 
-        Args:
-            strike: What is hit.
-            everything: Whether the whole system has to be back, and not only the victims.
-        """
+    def _strike(self, strike: Strike) -> bool:
+        """Hit, and wait for the repair; return whether the run lasted so long."""
         begun_s = time.monotonic()
         deadline = begun_s + BACK_WITHIN_S * len(strike.hits)
         before: dict[str, int] = {}
         missing = "a victim"
-        while time.monotonic() < deadline:
+        while missing and time.monotonic() < deadline:
             if self.over():
-                return None
-            if not before:
-                there = self._pids()
-                if set(strike.names) <= there.keys():
-                    before, begun_s = there, time.monotonic()
-                    self._send(strike, before)
-            elif not (missing := ", ".join(hit.name for hit in strike.hits
-                                           if not self._is_replaced(hit, before[hit.name]))):
-                missing = self._missing() if everything else ""
-                if not missing:
-                    return self._note(Struck(strike, time.monotonic() - begun_s))
+                return False
+            if before:
+                missing = ", ".join(hit.name for hit in strike.hits
+                                    if not self._is_replaced(hit, before[hit.name]))
+                missing = missing or (self._missing() if self._everything else "")
+            elif set(strike.names) <= (there := self._pids()).keys():
+                before, begun_s = there, time.monotonic()
+                self._send(strike, before)
             time.sleep(0.005)
-        return self._note(Struck(strike, None, missing))
+        back_s = None if missing else time.monotonic() - begun_s
+        self.struck.append(Struck(strike, back_s, missing))
+        self._report(self.struck[-1])
+        return True
 
-    def over(self) -> bool:
-        """Return whether the mission has ended, or the run."""
-        new = self._run.story_from(self._read)
-        whole = new[:new.rfind("\n") + 1]
-        self._read += len(whole.encode())
-        self._has_ended = self._has_ended or _ENDED.search(whole) is not None
-        for decision in _DECISION.finditer(whole):
-            self._decided = decision[1]
-        return self._has_ended or self._run.process.poll() is not None
-
-    def release(self) -> None:
+    def _release(self) -> None:
         """Reset the emergency stop, as an operator does, when nothing else keeps the robot."""
         latched = f"({EMERGENCY_STOP})" in self._decided and " for " not in self._decided
         if latched and not self.over():
             self.resets += self._run.tool("reset", EMERGENCY_STOP).returncode == 0
-
-    def _note(self, struck: Struck) -> Struck:
-        self.struck.append(struck)
-        self._report(struck)
-        return struck
 
     def _send(self, strike: Strike, pids: dict[str, int]) -> None:
         """Send each signal when it is due, those included that let the paused go on."""
@@ -288,7 +367,7 @@ class Chaos:
 
         The supervisor, which does not hear itself, shows by its table that it works.
         """
-        since_s = self._clock.now() - 1.0
+        since_s = self.now_s() - 1.0
         table = json.loads(printed(self._run, "node", "list", "--json") or "[]")
         there, wrong = self._pids(), []
         for row in table:
@@ -329,3 +408,238 @@ def complaints(code: int, result: Mapping[str, Any], story: str, lights: tuple[s
         if sorted((x.light, x.intensity_cd) for x in kept) != sorted(reported.items()):
             wrong.append(f"lights of {node}: {kept}, not {reported}")
     return wrong
+
+
+def usage(run: RealRun) -> dict[str, tuple[float, ...]]:
+    """Return each process's `FIGURES`; the memory is what it has of its own."""
+    pids = {p.names[0]: p.pid for p in find_processes(run.port)} | {ROOT_PROCESS: run.process.pid}
+    used = {}
+    for name, pid in pids.items():
+        with contextlib.suppress(psutil.Error):  # it has just ended
+            process = psutil.Process(pid)
+            used[name] = (process.memory_full_info().uss / 1e6, process.num_fds(),
+                          process.num_threads())
+    return used
+
+
+def rise(samples: Iterable[tuple[int, float, float]], counts: float) -> float:
+    """Return by how much a figure grows in an hour; 0 if that is no more than chance, or counts.
+
+    Args:
+        samples: Mission, seconds into it, and value.
+        counts: By how much in an hour it may grow.
+    """
+    missions: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for mission, into_s, value in samples:
+        if into_s >= WARM_UP_S:
+            missions[mission].append((into_s / 3600, value))
+    around = []
+    for points in missions.values():
+        hour, level = (statistics.fmean(column) for column in zip(*points, strict=True))
+        around += [(t - hour, value - level) for t, value in points]
+    if len({t for t, _ in around}) < 2 or len({value for _, value in around}) < 2:
+        return 0.0
+    times, values = zip(*around, strict=True)
+    slope = statistics.linear_regression(times, values).slope
+    is_clear = statistics.correlation(times, values) > CLEAR
+    return slope if is_clear and slope > counts else 0.0
+
+
+def growths(records: Sequence[Record]) -> list[str]:
+    """Return which figures grow: of all processes together, of the root, and of the others.
+
+    The two routers count as one: all clients are of one of them, and change over when it is killed.
+    """
+    samples = [r for r in records if r["kind"] == "sample"]
+    names = {name for r in samples for name in r["used"]} - set(ROUTERS)
+    found = []
+    for what in ("all", "routers", *sorted(names)):
+        for place, counts in enumerate(COUNTS.get(what, ONE)):
+            values = []
+            for r in samples:
+                members = {"all": r["used"], "routers": ROUTERS}.get(what, (what,))
+                if r["used"].keys() >= set(members):
+                    values.append((r["mission"], r["into_s"],
+                                   sum(r["used"][name][place] for name in members)))
+            if grown := rise(values, counts):
+                found.append(f"{what}: {FIGURES[place]} grow by {grown:.1f} an hour")
+    return found
+
+
+class Log:
+    """A file of JSON lines of one seed: what was done, so that an interrupted session continues."""
+
+    def __init__(self, file: Path, seed: int) -> None:
+        self.records: list[Record] = []
+        self._file = file
+        self._seed = seed
+        written = file.read_text(encoding="utf-8") if file.exists() else ""
+        for line in written.splitlines():
+            with contextlib.suppress(json.JSONDecodeError):  # cut off by an interruption
+                self.records.append(json.loads(line))
+        if any(record["seed"] != seed for record in self.records):
+            raise SystemExit(f"{file}: of another seed than {seed}; choose another --file")
+        if written and not written.endswith("\n"):
+            self._append("\n")
+
+    def add(self, kind: str, **fields: Any) -> None:
+        """Keep a record, also on disk."""
+        record = {"kind": kind, "seed": self._seed, **fields}
+        self.records.append(record)
+        self._append(json.dumps(record) + "\n")
+
+    def of(self, kind: str) -> list[Record]:
+        """Return the records of a kind."""
+        return [record for record in self.records if record["kind"] == kind]
+
+    @property
+    def lasted_s(self) -> float:
+        """Wall seconds of all missions, those that were cut included."""
+        return max((record["at_s"] for record in self.records), default=0.0)
+
+    def wrong(self) -> list[str]:
+        """Return what was not as it has to be."""
+        return [*(f"mission {r['mission']}: {line}" for r in self.of("mission")
+                  for line in r["wrong"]),
+                *(f"mission {r['mission']}, {r['at_s']:g} s: not back after {r['strike']}: "
+                  f"{r['missing']}" for r in self.of("hit") if r["back_s"] is None),
+                *growths(self.records)]
+
+    def _append(self, text: str) -> None:
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        with self._file.open("a", encoding="utf-8") as out:
+            out.write(text)
+
+
+def write_laps(directory: Path, laps: int) -> Path:
+    """Write mission AB and then its way again and again, without looking at the lights."""
+    goals = load_airport("vallombre").missions["AB"].goals
+    lines = [f"x={g.x_m},y={g.y_m},taxi={int(lap > 0 or g.mode == 'taxi')}"
+             for lap in range(laps + 1) for g in goals]
+    file = directory / "LAPS.miss"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def say(line: object) -> None:
+    """Print a line at once."""
+    print(line, flush=True)
+
+
+def one_mission(log: Log, options: argparse.Namespace, strikes: Sequence[Strike],
+                faults: Sequence[PlannedFault]) -> bool:
+    """Hit the processes of a mission; return whether it was as it has to be.
+
+    Its directory is kept if not.
+    """
+    number, is_soak = len(log.of("begin")), options.what == "soak"
+    zero_s = time.monotonic() - log.lasted_s
+    until_s = zero_s + 3600 * options.hours if is_soak else float("inf")
+    directory = (options.file.with_suffix("") / f"mission-{number}").resolve()
+
+    def keep(kind: str, **fields: object) -> None:
+        log.add(kind, at_s=round(time.monotonic() - zero_s, 3), mission=number, **fields)
+
+    def hit(struck: Struck) -> None:
+        keep("hit", strike=str(struck.strike), back_s=struck.back_s, missing=struck.missing)
+        say(struck)
+
+    def sample() -> None:
+        nonlocal sampled_s
+        if is_soak and time.monotonic() - sampled_s >= SAMPLE_S:
+            sampled_s = time.monotonic()
+            keep("sample", into_s=round(chaos.now_s() / options.rate, 2), used=usage(run))
+
+    keep("begin")
+    directory.mkdir(parents=True, exist_ok=True)
+    with RealRun(directory, SYSTEM, "--mission", str(write_laps(directory, options.laps)),
+                 "--rate", f"{options.rate:g}", "--hmi-port", str(free_base_port()), "--patience",
+                 "90", "--seed", str(options.seed + number),
+                 *(word for fault in faults for word in ("--fault", fault.text())),
+                 hmi=True) as run:
+        run.wait_for("goal 1/", END_WITHIN_S)
+        chaos = Chaos(run, hit, everything=options.what == "pairs", until_s=until_s)
+        sampled_s = time.monotonic()
+        chaos.carry_out(strikes, sample)
+        was_cut = time.monotonic() >= until_s or "UNSAFE" in run.story
+        if was_cut:
+            run.process.send_signal(signal.SIGTERM)
+        try:
+            code, result = run.result(END_WITHIN_S if was_cut else MISSION_S)
+        except (AssertionError, subprocess.TimeoutExpired) as error:
+            code, result = -1, {"mission": "fail", "safety": "not known", "reasons": [repr(error)]}
+    verdict = f"{'cut' if was_cut else result['mission']}, {result['safety']}"
+    if is_soak:
+        wrong = [] if result["safety"] == "safe" else result["reasons"]
+    else:
+        wrong = complaints(code, result, run.story, ("A", "B"))
+    if options.what == "ways" and chaos.resets:
+        wrong.append(f"{chaos.resets} emergency stops")
+    keep("mission", verdict=verdict, wrong=wrong, resets=chaos.resets)
+    say(f"mission {number}: {verdict}, {chaos.resets} resets; {log.lasted_s / 60:.1f} min")
+    if not wrong:
+        shutil.rmtree(directory)
+    return not wrong
+
+
+def session(log: Log, options: argparse.Namespace) -> None:
+    """Go on with missions until everything was hit, or they have lasted as long as asked."""
+    is_well, spec = True, load()
+    while is_well:
+        faults: list[PlannedFault] = []
+        if options.what == "soak":
+            strikes, faults = of_a_soak(spec, options.seed, len(log.of("begin")))
+            if log.lasted_s >= 3600 * options.hours - 1:
+                return
+        else:
+            plan = {"ways": each_in_every_way, "pairs": every_pair}[options.what]
+            strikes = plan(targets(spec), options.seed)[len(log.of("hit")):]
+            if not strikes:
+                return
+            strikes = [replace(one, at_s=one.at_s - strikes[0].at_s) for one in strikes]
+        is_well = one_mission(log, options, strikes, faults)
+
+
+def spread(seconds: Iterable[float | None]) -> str:
+    """Return median and maximum in milliseconds."""
+    known = [s for s in seconds if s is not None]
+    if not known:
+        return "nothing"
+    return (f"median {1e3 * statistics.median(known):.0f} ms, at most {1e3 * max(known):.0f} ms "
+            f"({len(known)})")
+
+
+def main() -> int:
+    """Run what was asked for and return the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("ways", "pairs", "soak"))
+    parser.add_argument("--seed", type=int, default=1, help="of the plan (default: 1)")
+    parser.add_argument("--rate", type=float, default=1.0, help="simulated seconds per second")
+    parser.add_argument("--file", type=Path, help="JSON lines of what was done")
+    parser.add_argument("--hours", type=float, default=1.0, metavar="H",
+                        help="how long the soak in the file is to last in all (default: 1)")
+    parser.add_argument("--laps", type=int, metavar="N", help="rounds of a mission after the "
+                        "lights, some three minutes each (default: 8 of a soak, else 4)")
+    options = parser.parse_args()
+    options.file = options.file or Path(f"reports/{options.what}.jsonl")
+    if options.laps is None:
+        options.laps = 8 if options.what == "soak" else 4
+    log = Log(options.file, options.seed)
+    session(log, options)
+    missions, hits = log.of("mission"), log.of("hit")
+    say(f"{log.lasted_s / 3600:.2f} hours, {sum(m['resets'] for m in missions)} resets of the "
+        f"emergency stop, {len(missions)} missions: "
+        + ", ".join(f"{count} {verdict}" for verdict, count in Counter(
+            m["verdict"] for m in missions).items()))
+    say(f"back after a hit: {spread(hit['back_s'] for hit in hits)}")
+    wrong = log.wrong()
+    for line in wrong:
+        say(f"WRONG {line}")
+    say("all as it has to be" if not wrong else f"{len(wrong)} things are wrong")
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a mission of the soak ends with it
+    sys.exit(main())

@@ -36,7 +36,7 @@ from rampart.sim.runs.virtual_run import VirtualRun
 from rampart.sim.virtual.virtual_processes import VirtualMachine
 from tests import ROOT
 from tests.actors.osmosis.control.world import Circle, World, drive
-from tests.whole.missions import SHORT_LIGHTS, write_short_mission
+from tests.whole.missions import SHORT_LIGHTS, write_mission
 
 P = m.MissionPhase
 GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
@@ -203,7 +203,7 @@ class Flight(MissionTrial):
 
 @pytest.fixture
 def short(tmp_path) -> Path:
-    return write_short_mission(tmp_path)
+    return write_mission(tmp_path, "SHORT")
 
 
 @pytest.mark.parametrize("seed", [

@@ -25,7 +25,7 @@ from rampart.manager.spec.specification import check_document, read_document
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.access.keyed import layout_of, make_keys
-from tests.whole.missions import write_taxi_mission
+from tests.whole.missions import write_mission
 
 pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(500)]
 
@@ -149,7 +149,7 @@ def test_a_full_disk_costs_what_cannot_be_written_and_nothing_else(tmp_path, mon
     """Checkpoints, folder of the run, recording and report lie on it."""
     with small_disk(tmp_path / "disk", 16) as disk:
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(disk))
-        with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path)),
+        with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI")),
                      "--report", str(disk / "report"), "--record", str(disk / "run.mcap")) as run:
             run.wait_for("goal 1/")
             time.sleep(3)
@@ -167,7 +167,7 @@ def test_a_full_disk_costs_what_cannot_be_written_and_nothing_else(tmp_path, mon
 
 
 def test_without_a_descriptor_what_runs_goes_on_and_what_ends_comes_back_later(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
         run.wait_for("goal 1/")
         time.sleep(3)
         before = pids(run)
@@ -183,7 +183,7 @@ def test_without_a_descriptor_what_runs_goes_on_and_what_ends_comes_back_later(t
 def test_the_time_of_day_may_jump_in_mid_run(tmp_path, monkeypatch):
     clock, day_s = OwnClock(tmp_path), 86_400
     monkeypatch.setattr(RealRun, "command", (*clock.before_command, *RealRun.command))
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
         run.wait_for("goal 1/")
         for jump_s in (400 * day_s, -3000 * day_s, 1, -1, 0):
             clock.jump(jump_s)
@@ -196,7 +196,7 @@ def test_the_time_of_day_may_jump_in_mid_run(tmp_path, monkeypatch):
 
 
 def test_a_member_that_hears_all_and_reads_nothing_is_let_go_of(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path))) as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
         run.wait_for("goal 1/")
         before, memory = pids(run), memory_mb(run)
         with member(run, HEARS_ALL) as slow:
@@ -282,7 +282,7 @@ def second_system(folder: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize(("kind", "rate"), [("busy", 2), ("sessions", 1), ("second", 2)])
 def test_the_mission_goes_on_after_an_overload(tmp_path, kind, rate):
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_taxi_mission(tmp_path)), "--rate",
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI")), "--rate",
                  str(rate), "--patience", "90") as run:
         run.wait_for("goal 1/")
         run.sleep_until(3.0)

@@ -13,7 +13,7 @@ import pytest
 
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
-from tests.whole.missions import write_near_mission
+from tests.whole.missions import write_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
@@ -49,7 +49,7 @@ def restarted_by(run: RealRun, seconds: float, last: Sequence[str] = (), killed:
 
 
 def test_after_pauses_of_everybody_only_what_died_or_hangs_is_restarted(tmp_path):
-    mission = write_near_mission(tmp_path)
+    mission = write_mission(tmp_path, "NEAR")
     with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:
         run.sleep_until(4.0)
         assert restarted_by(run, 3.0, ["supervisor"]) == set(), run.story

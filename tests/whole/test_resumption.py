@@ -19,7 +19,7 @@ from rampart.actors.supervision.process_title import RUN, find_processes
 from rampart.testing import wait_until
 from tests import ROOT
 from tests.whole.chaos import complaints
-from tests.whole.missions import small_files, write_near_mission, write_short_mission
+from tests.whole.missions import small_files, write_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(300)]
 
@@ -64,7 +64,7 @@ def test_a_run_that_is_cut_off_in_a_write_measures_each_light_once(tmp_path, see
     dice, report = random.Random(seed), tmp_path / "report"
     moments = ([(13.0, "osmosis_control"), (13.0, "mission_manager")] if seed is None
                else [(dice.uniform(3.0, LASTS_S), dice.choice(STATES))])
-    run = started(tmp_path, "--mission", str(write_short_mission(tmp_path)), "--rate", "2",
+    run = started(tmp_path, "--mission", str(write_mission(tmp_path, "SHORT")), "--rate", "2",
                   "--report", str(report))
     for after_s, node in moments:
         time.sleep(after_s)
@@ -79,7 +79,7 @@ def test_a_run_that_is_cut_off_in_a_write_measures_each_light_once(tmp_path, see
 def test_a_run_without_its_watching_process_is_resumed_and_no_other_in_its_place(
         tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
-    mission, report = str(write_near_mission(tmp_path)), str(tmp_path / "report")
+    mission, report = str(write_mission(tmp_path, "NEAR")), str(tmp_path / "report")
     anew = ("--mission", mission, "--report", report)
 
     def why_not(*options: str) -> str:

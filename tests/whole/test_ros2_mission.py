@@ -9,14 +9,14 @@ import pytest
 from rampart.cli.main import main
 from rampart.testing import RealRun, free_port
 from tests import ROOT
-from tests.whole.missions import write_near_mission, write_row_mission
+from tests.whole.missions import write_mission
 
 SYSTEM = ROOT / "systems/osmosis-ros2.toml"
 
 
 def test_a_mission_in_virtual_time_survives_the_gateway(tmp_path, capsys):
     assert main(["run", "--system", str(SYSTEM), "--virtual", "--json", "--report", str(tmp_path),
-                 "--mission", str(write_near_mission(tmp_path)), "--fault", "kill:gateway@6",
+                 "--mission", str(write_mission(tmp_path, "NEAR")), "--fault", "kill:gateway@6",
                  "--fault", "kill:osmosis_control@9"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["mission"], result["safety"]) == ("success", "safe")
@@ -42,7 +42,7 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path):
     victims = ("gateway", "ros_router", "osmosis_control", "gateway", "localization", "hmi",
                "ros_router", "safety_pilot", "ftm_manager")
     with RealRun(tmp_path, tmp_path / "ros.toml", "--mission",
-                 str(write_row_mission(tmp_path))) as run:
+                 str(write_mission(tmp_path, "ROW"))) as run:
         run.wait_for("goal 1/")
         for number, victim in enumerate(victims, 1):
             run.sleep_until(3.0 * number)

@@ -14,7 +14,7 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests.other_user import NOBODY, needs_root
-from tests.whole.missions import write_near_mission
+from tests.whole.missions import write_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, needs_root]
 
@@ -47,7 +47,7 @@ print(json.dumps({"knocked": {one: list(knock(one)) for one in addresses}, "squa
 
 def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
     """There is no port to join the bus at, and every socket is out of reach or does not answer."""
-    with RealRun(tmp_path, "paper", "--mission", str(write_near_mission(tmp_path))) as run:
+    with RealRun(tmp_path, "paper", "--mission", str(write_mission(tmp_path, "NEAR"))) as run:
         run.wait_for("goal 1/3")
         info = run.info
         lines = Path("/proc/net/unix").read_text(errors="replace").splitlines()[1:]

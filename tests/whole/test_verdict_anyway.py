@@ -21,7 +21,7 @@ from rampart.cli import run as launch
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.missions import small_files, write_short_mission
+from tests.whole.missions import small_files, write_mission
 
 UNSAFE = 3
 
@@ -32,7 +32,7 @@ UNSAFE_RUN = ("--virtual", "--system", "paper", "--no-ftm", "--fault", "command-
 def unsafe(tmp_path: Path, *more: str) -> list[str]:
     """Return the command of a run that ends unsafe."""
     return [sys.executable, str(ROOT / "launch.py"), *UNSAFE_RUN, "--mission",
-            str(write_short_mission(tmp_path)), "--json", "--report", str(tmp_path / "report"),
+            str(write_mission(tmp_path, "SHORT")), "--json", "--report", str(tmp_path / "report"),
             *more]
 
 

@@ -20,7 +20,7 @@ from rampart.sim.runs.virtual_run import LEAD_S
 from rampart.testing import HEEDS_SIGNALS, RealRun
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.missions import write_near_mission, write_short_mission
+from tests.whole.missions import write_mission
 
 OVERLOAD = "slow:all:0.025@20+30"
 
@@ -34,7 +34,7 @@ def job(*faults: str, options=None, **changes) -> Job:
 @pytest.fixture
 def near(tmp_path):
     """Options of a job: a mission of half a minute, a sixth of mission A."""
-    return {"mission": str(write_near_mission(tmp_path))}
+    return {"mission": str(write_mission(tmp_path, "NEAR"))}
 
 
 def decisions(result):
@@ -44,7 +44,7 @@ def decisions(result):
 def test_a_run_is_the_same_to_the_byte_in_another_process_and_another_with_another_seed(
         tmp_path, capsys):
     def arguments(seed: int) -> list[str]:
-        return ["--virtual", "--mission", str(write_near_mission(tmp_path)), "--seed", str(seed),
+        return ["--virtual", "--mission", str(write_mission(tmp_path, "NEAR")), "--seed", str(seed),
                 "--fault", "kill:mission_manager@6", "--fault", "wedge:DM2@3", "--fault",
                 "gps-noise@1", "--json", "--report", str(tmp_path / "report")]
 
@@ -150,7 +150,8 @@ def test_a_process_that_is_killed_or_silent_is_detected_and_replaced_and_the_mis
 
 
 def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(tmp_path):
-    mission = {"mission": str(write_short_mission(tmp_path))}  # long enough to blame a single node
+    # Long enough to blame a single node.
+    mission = {"mission": str(write_mission(tmp_path, "SHORT"))}
     record = run_virtually(job(OVERLOAD, system="osmosis", options=mission)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert [(d.active, d.recoveries) for d in record.decisions] == [

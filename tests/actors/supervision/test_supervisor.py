@@ -56,7 +56,7 @@ from rampart.testing import VirtualSystem, eventually, turns
 from tests import ROOT
 from tests.two_hosts import two_hosts
 from tests.virtual_time import within
-from tests.whole.missions import write_short_mission
+from tests.whole.missions import write_mission
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
 USUAL = Supervision()
@@ -769,7 +769,7 @@ def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(tmp_p
         + f"\n[supervision]\n{soon}", encoding="utf-8")
     result = run_virtually(Job(
         row="x", system=str(file), patience_s=120,
-        options={"mission": str(write_short_mission(tmp_path))},
+        options={"mission": str(write_mission(tmp_path, "SHORT"))},
         faults=(parse_fault(f"kill:{node}@15"),)))
     record = result.record
     assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
