@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import zenoh
@@ -41,6 +42,13 @@ def every_key(layout: Layout) -> list[str]:
     names = sorted((*layout.routers, *layout.members))
     return [key for row in table for key in (
         [row.replace("{name}", name) for name in names] if "{name}" in row else [row])]
+
+
+def covered(keys: Iterable[str], expressions: Iterable[str]) -> set[str]:
+    """Those of some keys below the root that one of the expressions includes."""
+    wanted = [zenoh.KeyExpr(one) for one in expressions]
+    return {key for key in keys
+            if any(one.includes(zenoh.KeyExpr(f"rampart/{key}")) for one in wanted)}
 
 
 @contextlib.contextmanager

@@ -22,20 +22,27 @@ from rampart.actors.bus.topics import INJECT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
 from rampart.actors.supervision.root import reserve_ports
-from tests.actors.access.declared import declared_rights
-from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, opened, wait_for
+from tests.actors.access.keyed import (
+    Keyed,
+    covered,
+    every_key,
+    layout_of,
+    make_keys,
+    opened,
+    wait_for,
+)
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 LAYOUT = layout_of("osmosis")
-_, DECLARED = declared_rights(LAYOUT)
+RIGHTS = rights_of_all(LAYOUT)
 KEYS = every_key(LAYOUT)
 NODES = ("safety_pilot", "ftm_manager", "supervisor", "DM4", "hmi", "observer")
 PEOPLE = {"ada": "operator", "bob": "viewer"}
 
 
 def may(name, what):
-    return DECLARED[PEOPLE.get(name, name)].get(what, set()).intersection(KEYS)
+    return covered(KEYS, getattr(RIGHTS[PEOPLE.get(name, name)], what))
 
 
 class Heard:
@@ -61,7 +68,7 @@ def test_an_identity_publishes_its_declared_outputs_only(keyed):
     with keyed.joined("bob") as viewer:
         held = viewer.declare_subscriber("rampart/**", heard.take)
         for name in [*NODES, *PEOPLE]:
-            arrived[name] = may(name, "says")
+            arrived[name] = may(name, "publishes")
             with keyed.joined(name) as session:
                 def tries(session=session, name=name):
                     for key in (*KEYS, "nothing/declared", "alive/DM4/9", "**", "heartbeat/*"):
@@ -80,7 +87,7 @@ def test_an_identity_publishes_its_declared_outputs_only(keyed):
 def test_an_identity_receives_its_declared_inputs_only(keyed):
     with keyed.joined("router_b") as everybody:
         for name in NODES:
-            heard, expected = Heard(), may(name, "hears")
+            heard, expected = Heard(), may(name, "subscribes")
             with keyed.joined(name) as session:
                 held = [session.declare_subscriber(key, heard.take) for key in (
                     *(f"rampart/{key}" for key in KEYS), "**", "rampart/**", "rampart/gone/*")]
@@ -119,7 +126,7 @@ def test_it_answers_for_its_own_topics_and_queries_its_inputs_only(keyed):
         all_answers = everybody.declare_queryable(
             "rampart/**", lambda q: q.reply(q.key_expr, "answer"), complete=True)
         for name in NODES:
-            asks = may(name, "asks")
+            asks = may(name, "queries")
             with keyed.joined(name) as session:
                 for key in sorted(asks)[:3]:
                     assert wait_for(lambda key=key: replies(session, key)), (name, key)
