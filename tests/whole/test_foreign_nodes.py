@@ -7,14 +7,14 @@ import json
 import os
 import signal
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-import psutil
 import pytest
 
 from rampart.actors.foreign.descendants import descendants
 from rampart.actors.supervision.kill_node import signal_node
-from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.process_title import process_state
 from rampart.testing import RealRun
 from tests.documents.test_foreign_nodes import nodes
 from tests.tug import TUG, write_tug
@@ -30,18 +30,11 @@ while :; do sleep 603; done
 """
 """Ignores what it is asked, and forks: into another session, without environment, as a daemon."""
 
-def with_forking(folder: Path) -> None:
-    """Write the tug of the page, with a node that forks."""
-    write_tug(folder)
-    (folder / "forking").write_text(FORKING)
-    (folder / "forking").chmod(0o755)
-    (folder / "tug.toml").write_text(TUG.replace("[[event]]", """
-[[node]]
-name = "forking"
-command = ["./forking"]
-kind = "non-control"
 
-[[event]]"""))
+def node(name: str, command: Sequence[str], more: str = "") -> str:
+    """Return the row of a node with a command."""
+    return (f'\n[[node]]\nname = "{name}"\nkind = "non-control"\n'
+            f"command = {json.dumps(command)}\n{more}\n")
 
 
 def below(tug: RealRun, node: str) -> dict[int, str]:
@@ -84,18 +77,23 @@ def all_forked(tug: RealRun) -> list[int]:
     return list(below(tug, "forking"))
 
 
-def without_wheels(folder: Path, more: str, grace_s: float = 5.0) -> None:
+def write_system(folder: Path, rows: str, grace_s: float = 5.0) -> None:
     """Write the tug's system with other nodes in the place of driver and wheels."""
+    write_tug(folder, compiled=False)
     head, _, rest = TUG.partition('[[node]]\nname = "driver"')
     head = head.replace("[timing]", f"[timing]\nstartup_grace_s = {grace_s}")
-    (folder / "tug.toml").write_text(head + more + "\n" + rest[rest.index("[[event]]"):])
+    (folder / "tug.toml").write_text(head + rows + rest[rest.index("[[event]]"):])
 
 
 def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_path):
-    with_forking(tmp_path)
+    write_tug(tmp_path)
+    (tmp_path / "forking").write_text(FORKING)
+    (tmp_path / "forking").chmod(0o755)
+    (tmp_path / "tug.toml").write_text(
+        TUG.replace("[[event]]", node("forking", ["./forking"]) + "\n[[event]]"))
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(0)
-        node = tug.pid("wheels")
+        own = tug.pid("wheels")
 
         os.kill(find(tug, "wheels", "wheels"), signal.SIGKILL)  # the program
         tug.wait_for("wheels crashed, incarnation 1: ./wheels ended: signal SIGKILL; "
@@ -113,7 +111,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         tug.wait_for(f"wheels crashed, incarnation 4: ./wheels no such program in {tmp_path};")
         (tmp_path / "away").rename(file)
         tug.wait_until(lambda: state(tug, "wheels")[0] == "running", 10, "wheels did not come")
-        assert tug.pid("wheels") == node, "its process has stayed"
+        assert tug.pid("wheels") == own, "its process has stayed"
 
         incarnation = 1
         for victims in (["forking"], ["forking", "supervisor"]):
@@ -150,23 +148,18 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
 
 
 def test_a_signal_that_stops_a_command_reaches_its_program_and_what_that_has_forked(tmp_path):
-    write_tug(tmp_path, compiled=False)
-    without_wheels(tmp_path, "".join(f"""
-[[node]]
-name = "{name}"
-process = "both"
-command = ["sh", "-c", "sleep 606; echo {name}"]
-kind = "non-control"
-""" for name in ("first", "second")))
+    write_system(tmp_path, "".join(
+        node(name, ["sh", "-c", f"sleep 606; echo {name}"], 'process = "both"')
+        for name in ("first", "second")))
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(0.5)
-        node, first = tug.pid("first"), find(tug, "first", "echo first")
+        own, first = tug.pid("first"), find(tug, "first", "echo first")
         second = find(tug, "second", "echo second")
         asleep = {pid for pid, line in below(tug, "first").items() if line == "sleep 606"}
         assert signal_node("first", "STOP", tug.port).pid == first
 
         def stopped():
-            return {pid for pid in (first, second, node, *asleep) if process_state(pid) == "T"}
+            return {pid for pid in (first, second, own, *asleep) if process_state(pid) == "T"}
 
         tug.wait_until(lambda: len(stopped()) == 2, 2, "not stopped")
         assert stopped() - asleep == {first}
@@ -204,20 +197,14 @@ class Carrier(Actor):
 
 
 def test_a_program_is_not_blamed_while_the_node_that_publishes_its_heartbeat_restarts(tmp_path):
-    write_tug(tmp_path, compiled=False)
     (tmp_path / "carrier.py").write_text(CARRIER)
-    without_wheels(tmp_path, """
+    write_system(tmp_path, """
 [[node]]
 name = "carrier"
 actor = "carrier:Carrier"
 kind = "non-control"
-
-[[node]]
-name = "sleeper"
-command = ["sleep", "605"]
-kind = "non-control"
-heartbeat = { key = "sleeper/alive", timeout_s = 0.5 }
-""", 2.5)
+""" + node("sleeper", ["sleep", "605"],
+           'heartbeat = { key = "sleeper/alive", timeout_s = 0.5 }'), 2.5)
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(2)
         tug.kill("carrier")
@@ -262,28 +249,15 @@ if first and how == "needs time":
 beat(600)
 """
 
-COLD = """
-import os, time
-
-with open("starts", "a") as starts:
-    starts.write("x")
-time.sleep(9)
-"""
-
 
 def test_what_sd_notify_says_is_taken_as_it_is_documented(tmp_path):
-    write_tug(tmp_path, compiled=False)
     (tmp_path / "program.py").write_text(PROGRAM)
     spoken = {"child": "its child beats", "stopping": "says that it ends", "slow": "needs time"}
     commands = {name: ["python3", "program.py", how] for name, how in spoken.items()}
     commands["cold"] = ["sh", "-c", "echo x >> starts; sleep 9"]
-    without_wheels(tmp_path, "".join(f"""
-[[node]]
-name = "{name}"
-command = {json.dumps(command)}
-kind = "non-control"
-heartbeat = {{ notify = true, timeout_s = 1.0 }}
-""" for name, command in commands.items()), 2.5)
+    write_system(tmp_path, "".join(
+        node(name, command, "heartbeat = { notify = true, timeout_s = 1.0 }")
+        for name, command in commands.items()), 2.5)
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.wait_for("child crashed, incarnation 1: python3 was stopped for 1 s;")
         tug.wait_for("stopping crashed, incarnation 1: python3 hung: no heartbeat for 1 s;")
@@ -298,45 +272,15 @@ heartbeat = {{ notify = true, timeout_s = 1.0 }}
         assert "STATUS=up and well" in tug.tool("node", "log", "slow").stdout
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.3])
-def test_ctrl_c_in_the_start_leaves_no_traceback_and_no_program(tmp_path, after_s):
-    with_forking(tmp_path)
-    with RealRun(tmp_path, "tug.toml") as tug:
-        tug.wait_until(lambda: find_processes(tug.port) != [], 20, "no process was started")
-        time.sleep(after_s)
-        tug.process.send_signal(signal.SIGINT)
-        tug.process.wait(20)
-    assert "Traceback" not in tug.story
-    places = {}
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            places[process.pid] = process.cwd()
-    assert str(tmp_path) not in places.values()
-
-
 def test_a_program_that_may_end_stays_ended_one_that_fails_is_restarted_and_a_limit_is_kept(
         tmp_path):
-    write_tug(tmp_path, compiled=False)
-    hungry = json.dumps(["python3", "-c", "x = bytearray(10**9)"])
-    without_wheels(tmp_path, f"""
-[[node]]
-name = "calibration"
-command = ["sh", "-c", "echo $RAMPART_INCARNATION >> calibrated"]
-may_end = true
-kind = "non-control"
-
-[[node]]
-name = "failing"
-command = ["sh", "-c", "[ $RAMPART_INCARNATION -gt 2 ]"]
-may_end = true
-kind = "non-control"
-
-[[node]]
-name = "hungry"
-command = {hungry}
-kind = "non-control"
-limits = {{ memory_mb = 300, processor_s = 5, open_files = 32, file_mb = 1 }}
-""")
+    write_system(
+        tmp_path,
+        node("calibration", ["sh", "-c", "echo $RAMPART_INCARNATION >> calibrated"],
+             "may_end = true")
+        + node("failing", ["sh", "-c", "[ $RAMPART_INCARNATION -gt 2 ]"], "may_end = true")
+        + node("hungry", ["python3", "-c", "x = bytearray(10**9)"],
+               "limits = { memory_mb = 300, processor_s = 5, open_files = 32, file_mb = 1 }"))
     with RealRun(tmp_path, "tug.toml", "--duration", "30") as tug:
         tug.sleep_until(1)
         tug.wait_until(lambda: state(tug, "failing") == ("running", 3), 20, "it was not restarted")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import resource
 import shutil
@@ -41,71 +42,73 @@ with join() as session:
     time.sleep(1000)
 """
 
-class OwnClock:
-    """A time of day for a run alone, which may jump."""
-
-    def __init__(self, folder: Path) -> None:
-        compiler = shutil.which("cc")
-        if compiler is None:
-            pytest.skip("no C compiler: the time of day cannot be changed for one run alone")
-        library, self._file = folder / "clock_shift.so", folder / "shift"
-        subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", str(library),
-                        str(Path(__file__).with_name("clock_shift.c"))], check=True)
-        self.before_command = ("env", f"LD_PRELOAD={library}", f"SHIFT_FILE={self._file}")
-        self._file.write_bytes(bytes(8))
-
-    def jump(self, shift_s: int) -> None:
-        """Be so far off the true time from now on."""
-        with self._file.open("r+b", buffering=0) as shift:
-            shift.write(shift_s.to_bytes(8, sys.byteorder, signed=True))
 
 
-@contextmanager
-def small_disk(folder: Path, size_mb: int) -> Iterator[Path]:
-    """Mount a file system that is soon full."""
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size_mb}m,mode=0700", "tmpfs", str(folder)],
-        check=False, capture_output=True, text=True)
-    if mounted.returncode:
-        pytest.skip(f"no file system may be mounted here: {mounted.stderr.strip()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+def full_disk(run: RealRun) -> None:
+    """Fill the disk with checkpoints, folder of the run, recording and report; kill; make room."""
+    filler = run.directory / "disk" / "filler"
+    with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+    time.sleep(3)
+    respawn(run, "osmosis_control", "localization")
+    time.sleep(3)
+    assert "No space left on device" in run.story
+    filler.unlink()
 
 
-def fill(folder: Path) -> Path:
-    """Write a file until the disk is full."""
-    file = folder / "filler"
-    with file.open("wb", buffering=0) as filler:
-        try:
-            while True:
-                filler.write(bytes(4096))
-        except OSError:
-            return file
+def no_descriptor(run: RealRun) -> None:
+    """Let no process of the run open anything more: what runs goes on, what ends comes later."""
+    held = [process.pid for process in processes(run).values()]
+    before = {pid: resource.prlimit(pid, resource.RLIMIT_NOFILE) for pid in held}
+    there = pids(run)
+    for pid, (_, hard) in before.items():
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, hard))
+    time.sleep(3)
+    assert pids(run) == there
+    run.kill("localization")
+    time.sleep(3)
+    for pid, limits in before.items():
+        if psutil.pid_exists(pid):
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+    run.wait_for("localization respawned")
+
+
+def jumping_clock(run: RealRun) -> None:
+    """Have the time of day of the run jump."""
+    day_s = 86_400
+    with (run.directory / "shift").open("r+b", buffering=0) as shift:
+        for jump_s in (400 * day_s, -3000 * day_s, 1, -1, 0):
+            shift.seek(0)
+            shift.write(jump_s.to_bytes(8, sys.byteorder, signed=True))
+            time.sleep(2)
+            if jump_s < -1:
+                respawn(run, "localization")
+
+
+def deaf_member(run: RealRun) -> None:
+    """Have a member subscribe to everything, and read nothing."""
+    before, memory = pids(run), memory_mb(run)
+    with member(run, HEARS_ALL) as slow:
+        slow.send_signal(signal.SIGSTOP)
+        time.sleep(15)
+        assert grown(run, memory) == {}
+        assert set(ROUTERS) <= memory_mb(run).keys()
+        assert pids(run) == before
+
+
+def respawn(run: RealRun, *nodes: str) -> None:
+    """Kill nodes, and wait until they are back."""
+    for node in nodes:
+        run.kill(node)
+    for node in nodes:
+        run.wait_for(f"{node} respawned")
 
 
 def processes(run: RealRun) -> dict[str, psutil.Process]:
     """Return the processes of a run that are there now, the launcher among them."""
     found = {" ".join(p.names): psutil.Process(p.pid) for p in find_processes(run.port)}
     return found | {"launcher": psutil.Process(run.process.pid)}
-
-
-@contextmanager
-def no_descriptor_left(run: RealRun) -> Iterator[None]:
-    """Let no process of a run open anything more."""
-    held = processes(run)
-    before = {pid: resource.prlimit(pid, resource.RLIMIT_NOFILE)
-              for pid in (process.pid for process in held.values())}
-    for pid, (_, hard) in before.items():
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, hard))
-    try:
-        yield
-    finally:
-        for pid, limits in before.items():
-            if psutil.pid_exists(pid):
-                resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
 
 
 @contextmanager
@@ -127,17 +130,14 @@ def member(run: RealRun, script: str, *arguments: str, key: str | Path = ""
             process.kill()
 
 
-def succeeds(run: RealRun) -> dict[str, object]:
-    """Wait for the end, and see that it is a good one."""
-    run.wait_until(lambda: run.process.poll() is not None, 150, "it goes on and on")
-    code, result = run.result()
-    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
-    return result
-
-
 def memory_mb(run: RealRun) -> dict[str, float]:
     """Return how much each process holds."""
     return {name: p.memory_info().rss / 1e6 for name, p in processes(run).items()}
+
+
+def grown(run: RealRun, before: dict[str, float]) -> dict[str, float]:
+    """Return which processes hold much more than before."""
+    return {name: mb for name, mb in memory_mb(run).items() if mb > before.get(name, mb) + MORE_MB}
 
 
 def pids(run: RealRun) -> dict[str, int]:
@@ -145,70 +145,45 @@ def pids(run: RealRun) -> dict[str, int]:
     return {name: p.pid for name, p in processes(run).items() if "spare" not in name}
 
 
-def test_a_full_disk_costs_what_cannot_be_written_and_nothing_else(tmp_path, monkeypatch):
-    """Checkpoints, folder of the run, recording and report lie on it."""
-    with small_disk(tmp_path / "disk", 16) as disk:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(disk))
-        with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI")),
-                     "--report", str(disk / "report"), "--record", str(disk / "run.mcap")) as run:
-            run.wait_for("goal 1/")
-            time.sleep(3)
-            full = fill(disk)
-            time.sleep(3)
-            run.kill("osmosis_control")
-            run.kill("localization")
-            run.wait_for("localization respawned")
-            run.wait_for("osmosis_control respawned")
-            time.sleep(3)
-            full.unlink()
-            result = succeeds(run)
-        assert set(result["restarts"]) >= {"osmosis_control", "localization"}
-        assert "No space left on device" in run.story
+@pytest.fixture
+def own_disk_and_clock(tmp_path, monkeypatch):
+    """Give runs a small disk for all that they write, and a time of day that may jump."""
+    disk, compiler = tmp_path / "disk", shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler: the time of day cannot be changed for one run alone")
+    library, shift = tmp_path / "clock_shift.so", tmp_path / "shift"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", str(library),
+                    str(Path(__file__).with_name("clock_shift.c"))], check=True)
+    shift.write_bytes(bytes(8))
+    monkeypatch.setattr(RealRun, "command", (
+        "env", f"LD_PRELOAD={library}", f"SHIFT_FILE={shift}", *RealRun.command))
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64m,mode=0700", "tmpfs", str(disk)],
+        check=False, capture_output=True, text=True)
+    if mounted.returncode:
+        pytest.skip(f"no file system may be mounted here: {mounted.stderr.strip()}")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(disk))
+    yield
+    subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
-def test_without_a_descriptor_what_runs_goes_on_and_what_ends_comes_back_later(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
+@pytest.mark.parametrize(("hardship", "restarted"), [
+    (full_disk, {"osmosis_control", "localization"}), (no_descriptor, {"localization"}),
+    (jumping_clock, {"localization"}), (deaf_member, set())])
+@pytest.mark.usefixtures("own_disk_and_clock")
+def test_a_mission_succeeds_whatever_runs_out_or_is_wrong_for_a_while(
+        tmp_path, hardship, restarted):
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI")), "--report",
+                 "disk/report", "--record", "disk/run.mcap") as run:
         run.wait_for("goal 1/")
         time.sleep(3)
-        before = pids(run)
-        with no_descriptor_left(run):
-            time.sleep(3)
-            assert pids(run) == before
-            run.kill("localization")
-            time.sleep(3)
-        run.wait_for("localization respawned")
-        succeeds(run)
-
-
-def test_the_time_of_day_may_jump_in_mid_run(tmp_path, monkeypatch):
-    clock, day_s = OwnClock(tmp_path), 86_400
-    monkeypatch.setattr(RealRun, "command", (*clock.before_command, *RealRun.command))
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
-        run.wait_for("goal 1/")
-        for jump_s in (400 * day_s, -3000 * day_s, 1, -1, 0):
-            clock.jump(jump_s)
-            time.sleep(2)
-            if jump_s < -1:
-                run.kill("localization")
-                run.wait_for("localization respawned")
-        result = succeeds(run)
-    assert result["restarts"] == {"localization": 1}
-
-
-def test_a_member_that_hears_all_and_reads_nothing_is_let_go_of(tmp_path):
-    with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI"))) as run:
-        run.wait_for("goal 1/")
-        before, memory = pids(run), memory_mb(run)
-        with member(run, HEARS_ALL) as slow:
-            slow.send_signal(signal.SIGSTOP)
-            time.sleep(15)
-            after = memory_mb(run)
-            assert pids(run) == before
-        result = succeeds(run)
-    assert {name: after[name] - memory[name] for name in memory.keys() & after.keys()
-            if after[name] - memory[name] > MORE_MB} == {}
-    assert set(ROUTERS) <= after.keys()
-    assert result["restarts"] == {}
+        hardship(run)
+        run.wait_until(lambda: run.process.poll() is not None, 150, "it goes on and on")
+        code, result = run.result()
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
+    assert set(result["restarts"]) >= restarted
+    assert hardship is full_disk or set(result["restarts"]) == restarted
 
 
 @pytest.mark.parametrize("thief", ["", "DM5", "ada"])
@@ -232,9 +207,7 @@ def test_a_member_that_floods_delays_no_emergency_stop_and_harms_nobody(tmp_path
                 took_s = sorted(asyncio.run(_stops(run.port, 7)))
                 died = {name for name, pid in pids(run).items() if before[name] != pid}
                 assert died <= {thief}, kind  # what is said in its name counts as its own
-                grown = {n: mb - memory[n] for n, mb in memory_mb(run).items()
-                         if n in memory and mb - memory[n] > MORE_MB}
-                assert grown == {}, kind
+                assert grown(run, memory) == {}, kind
             assert took_s[len(took_s) // 2] < spec.timing.arbitration_s, (kind, took_s)
 
 
@@ -272,21 +245,14 @@ def busy_processes(*, in_sessions: bool) -> Iterator[None]:
             process.wait()
 
 
-@contextmanager
-def second_system(folder: Path) -> Iterator[None]:
-    """Drive another mission on the same machine."""
-    folder.mkdir()
-    with RealRun(folder, "osmosis", "--rate", "2"):
-        yield
-
-
 @pytest.mark.parametrize(("kind", "rate"), [("busy", 2), ("sessions", 1), ("second", 2)])
 def test_the_mission_goes_on_after_an_overload(tmp_path, kind, rate):
     with RealRun(tmp_path, "osmosis", "--mission", str(write_mission(tmp_path, "TAXI")), "--rate",
                  str(rate), "--patience", "90") as run:
         run.wait_for("goal 1/")
         run.sleep_until(3.0)
-        with (second_system(tmp_path / "second") if kind == "second"
+        (tmp_path / "second").mkdir()
+        with (RealRun(tmp_path / "second", "osmosis", "--rate", "2") if kind == "second"
               else busy_processes(in_sessions=kind == "sessions")):
             time.sleep(15.0)
         _, result = run.result(300)

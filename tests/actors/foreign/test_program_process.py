@@ -84,15 +84,6 @@ def are_gone(pids) -> bool:
     return all(process_state(pid) in "XZ" for pid in pids)
 
 
-@isolated
-async def test_its_end_is_told_once_with_all_that_it_has_printed(tmp_path):
-    started = Started(tmp_path, "echo first; echo last >&2; exit 3")
-    assert await started.end() == "ended: exit code 3"
-    assert started.log.read_text() == "first\nlast\n"
-    started.process.kill()  # harmless
-    started.process.end()
-
-
 @pytest.mark.parametrize("how", ["ends", "is killed", "is asked to end"])
 @isolated
 async def test_all_that_it_has_forked_ends_with_it(tmp_path, how):
@@ -126,16 +117,20 @@ async def test_it_may_end_in_order_when_it_is_asked_to_also_if_it_is_stopped(tmp
 
 
 @isolated
-async def test_daemons_that_end_before_it_leave_no_zombies(tmp_path):
+async def test_daemons_that_end_before_it_leave_no_zombies_and_its_own_end_is_told_once(tmp_path):
     os.mkfifo(tmp_path / "go")
     started = Started(tmp_path, "for i in 1 2 3; do (setsid sh -c 'echo >> ends' & ); done; "
-                                "read _ < go; exit 4")
+                                "echo first; read _ < go; echo last >&2; exit 4")
     ends = tmp_path / "ends"
     await eventually(lambda: ends.exists() and len(ends.read_text()) == 3)
     await eventually(lambda: not any(
         one.status() == psutil.STATUS_ZOMBIE for one in psutil.Process().children()))
     (tmp_path / "go").write_text("\n")
     assert await started.end() == "ended: exit code 4"
+    assert started.log.read_text() == "first\nlast\n"
+    started.process.kill()  # harmless
+    started.process.end()
+    assert started.ends == ["ended: exit code 4"]
 
 
 @pytest.mark.parametrize(("file", "code", "reason"), [
@@ -208,17 +203,16 @@ SEND_BELOW = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {SE
 def test_a_datagram_of_a_living_descendant_counts_and_no_other():
     refused: list[tuple[str, str]] = []
     notify = NotifySocket("wheels", lambda *why: refused.append(why))
-    environment = {**os.environ, "NOTIFY_SOCKET": notify.name}
-    with subprocess.Popen([sys.executable, "-c", SEND_BELOW], env=environment,
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as below:
+    started = functools.partial(
+        subprocess.Popen, env={**os.environ, "NOTIFY_SOCKET": notify.name},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with started([sys.executable, "-c", SEND_BELOW]) as below:
         assert below.stdout.readline() == b"sent\n"
         assert notify.take() == ["below"]
         below.stdin.close()
     assert refused == []
-    subprocess.run([sys.executable, "-c", SEND, "ended"], env=environment, check=True,
-                   stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    with subprocess.Popen(["sh", "-c", '"$@" <&0 &', "sh", sys.executable, "-c", SEND, "orphan"],
-                          env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as gone:
+    started([sys.executable, "-c", SEND, "ended"]).communicate()
+    with started(["sh", "-c", '"$@" <&0 &', "sh", sys.executable, "-c", SEND, "orphan"]) as gone:
         gone.wait()
         assert gone.stdout.readline() == b"sent\n"  # by a process that lives, and not below
         assert notify.take() == []
@@ -237,31 +231,25 @@ def test_a_path_of_python_is_inherited_unless_it_leads_to_this_rampart(monkeypat
     assert inherited_environment() == dict(os.environ)
 
 
-def test_silence_counts_from_the_last_beat_and_what_it_says_itself_at_once():
+def wells(pulse: Pulse, *tenths: int) -> list[bool]:
+    return [pulse.is_well(n / 10) for n in tenths]
+
+
+def test_silence_counts_from_the_last_beat_unless_its_own_word_or_node_says_otherwise():
     pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    assert wells(pulse, 0, 10, 20) == [True] * 3  # the first beat may come later
+    assert wells(pulse, *range(20, 80))[::40] == [True, True]
+    assert not pulse.is_well(8.0)
     pulse.beat()
-    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    assert wells(pulse, *range(80, 88)) == [True] * 6 + [False] * 2
     pulse.beat()
-    assert pulse.is_well(0.8)
+    assert pulse.is_well(8.8)
+    assert wells(pulse, 680, 681) == [True] * 2  # the node itself stood still
+    assert not any(wells(pulse, *range(685, 690)))
+    pulse.beat()
+    assert pulse.is_well(69.0)
     pulse.trigger()
-    assert not pulse.is_well(0.8)
-
-
-def test_the_first_beat_may_come_later():
-    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
-    assert [pulse.is_well(n / 10) for n in (0, 10, 20)] == [True] * 3
-    wells = [pulse.is_well(2.0 + n / 10) for n in range(60)]
-    assert wells[40]
-    assert not wells[-1]
-
-
-def test_time_in_which_the_node_itself_stood_still_does_not_count():
-    pulse = Pulse(timeout_s=0.5, first_s=0.5, look_s=0.2)
-    pulse.beat()
-    assert pulse.is_well(0.0)
-    assert pulse.is_well(60.0)
-    assert pulse.is_well(60.1)
-    assert not any(pulse.is_well(60.0 + n / 10) for n in range(5, 10))
+    assert not pulse.is_well(69.0)
 
 
 @pytest.mark.parametrize("started", [False, True])
@@ -270,10 +258,9 @@ def test_it_may_ask_for_more_time_until_its_next_beat(started):
     if started:
         pulse.beat()
     pulse.extend(3.0)
-    wells = [pulse.is_well(n / 10) for n in range(40)]
-    assert wells == [True] * 31 + [False] * 9
+    assert wells(pulse, *range(40)) == [True] * 31 + [False] * 9
     pulse.beat()
-    assert [pulse.is_well(4.0 + n / 10) for n in range(8)][-1] is False, "the usual time again"
+    assert wells(pulse, *range(40, 48))[-1] is False, "the usual time again"
 
 
 def test_silence_does_not_count_while_a_carrier_is_down_and_starts_again_after_its_restart():
@@ -282,28 +269,26 @@ def test_silence_does_not_count_while_a_carrier_is_down_and_starts_again_after_i
     pulse.note_process("gateway", "crashed")
     pulse.beat()  # which shows that it works, though its event was lost
     pulse.note_process("other", "crashed")
-    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    assert wells(pulse, *range(8)) == [True] * 6 + [False] * 2
     pulse.beat()
     for failure in ("wedged", "crashed", "given up"):
         pulse.note_process("gateway", failure)
-    assert all(pulse.is_well(1.0 + n / 10) for n in range(50))
+    assert all(wells(pulse, *range(10, 60)))
     pulse.restart()  # of the program
-    assert all(pulse.is_well(6.0 + n / 10) for n in range(50))
+    assert all(wells(pulse, *range(60, 110)))
     pulse.note_process("gateway", "respawned")
-    wells = [pulse.is_well(11.0 + n / 10) for n in range(13)]
-    assert wells[:10] == [True] * 10
-    assert wells[-2:] == [False] * 2
+    after = wells(pulse, *range(110, 123))
+    assert after[:10] + after[-2:] == [True] * 10 + [False] * 2
 
 
 def test_one_that_says_that_it_ends_has_to_end():
     pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
     pulse.stopping()
-    wells = []
+    after = []
     for n in range(10):
         pulse.beat()
-        wells.append(pulse.is_well(n / 10))
-    assert wells[:5] == [True] * 5
-    assert not wells[-1]
+        after += wells(pulse, n)
+    assert after[:5] + after[-1:] == [True] * 5 + [False]
 
 
 @pytest.mark.parametrize(("text", "seconds"), [
@@ -335,41 +320,33 @@ def clock(monkeypatch):
     return now_s
 
 
-def test_output_goes_on_in_a_second_file_and_never_beyond(tmp_path, clock):
+def test_output_goes_on_in_a_second_file_and_never_beyond_and_one_of_its_name_is_always_there(
+        tmp_path, clock, monkeypatch):
     file, before = tmp_path / "a.log", tmp_path / "a.log.1"
     file.write_bytes(b"x" * 950)
-    log = OutputLog(file, most=1000)
+    log, is_there = OutputLog(file, most=1000), []
     log.write(b"new\n" * 20)
     assert before.read_bytes() == b"x" * 950, "of the incarnation before"
-    for number in range(100):
-        clock[0] += 1.0
-        log.write(b"%09d\n" % number * 10)
-        assert file.stat().st_size <= 1000
-    assert before.stat().st_size <= 1000
-    assert {entry.name for entry in tmp_path.iterdir()} == {"a.log", "a.log.1"}
-    assert (before.read_bytes() + file.read_bytes()).endswith(b"000000099\n")
-    assert b"000000090\n" in before.read_bytes() + file.read_bytes()
-
-
-def test_there_is_a_file_of_its_name_at_any_moment(tmp_path, clock, monkeypatch):
-    file = tmp_path / "a.log"
-    log = OutputLog(file, most=100)
-    seen = []
 
     def watched(real, *given):
-        seen.append(file.exists())
+        is_there.append(file.exists())
         done = real(*given)
-        seen.append(file.exists())
+        is_there.append(file.exists())
         return done
 
     for name in ("unlink", "link", "replace", "open"):
         monkeypatch.setattr(output_log.os, name, partial(watched, getattr(os, name)))
-    log.write(b"x" * 60)
-    seen.clear()
-    for _ in range(5):
-        log.write(b"x" * 60)
-    assert seen
-    assert all(seen)
+    for number in range(100):
+        clock[0] += 1.0
+        log.write(b"%09d\n" % number * 10)
+        assert file.stat().st_size <= 1000
+    assert is_there
+    assert all(is_there)
+    assert before.stat().st_size <= 1000
+    assert {entry.name for entry in tmp_path.iterdir()} == {"a.log", "a.log.1"}
+    kept = before.read_bytes() + file.read_bytes()
+    assert kept.endswith(b"000000099\n")
+    assert b"000000090\n" in kept
 
 
 def test_a_flood_is_counted_where_it_is_too_much_and_the_count_is_told(tmp_path, clock):
