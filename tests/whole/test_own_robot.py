@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from rampart.cli.main import main
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
 from rampart.testing import RealRun, free_base_port
@@ -107,19 +106,6 @@ class Own(StubNode):
 '''
 
 
-def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_failed(tmp_path):
-    (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(changed(
-        PAPER, (WORLD, '[[node]]\nname = "own"\nactor = "own:Own"\nkind = "non-control"\n')))
-    report = tmp_path / "report"
-    done = launched(tmp_path, "--system", "own.toml", "--virtual", "--patience", "2", "--report",
-                    str(report))
-    assert done.returncode == 4, done.stderr
-    assert f"launch.py: tracebacks of failed processes: {report / 'errors.log'}" in done.stderr
-    assert "own failed: KeyError: 'speed_mps'" in done.stderr
-    assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
-
-
 @pytest.mark.processes
 def test_actors_beside_the_caller_are_found_by_toolbox_and_run_which_tells_of_tracebacks(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
@@ -188,7 +174,3 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
     assert [d["recoveries"] for d in result["decisions"]][:1] == [["R_RESTART_MOTION"]]
 
 
-@pytest.mark.parametrize("verb", ["cut-sets", "explain"])
-def test_the_verbs_take_it(capsys, verb):
-    assert main([verb, str(FILE), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)

@@ -79,6 +79,12 @@ def held(node: str, record: Record, *, final: bool = False) -> KeptState:
     return KeptState(node, *record, issued=10 * EPOCH, final=final)
 
 
+def exchange(robot: Host, ground: Host) -> None:
+    """Both publish what they hold, and receive it."""
+    ground.receive("", robot.message())
+    robot.receive("ground", ground.message())
+
+
 def test_a_message_has_all_since_everything_was_repeated_and_what_a_full_disk_lost_comes_again(
         robot, ground):
     ground.message()
@@ -134,6 +140,49 @@ def test_the_largest_states_of_all_nodes_come_one_by_one_and_fit_into_a_message(
     assert size < MAX_PAYLOAD_BYTES - 3 * LARGEST_STATE_BYTES
 
 
+def taken_over(robot: Host, ground: Host) -> None:
+    """Have the camera run on the robot, from its state, while its own host cannot be reached."""
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 10))
+    exchange(robot, ground)
+    robot.copies.lose("ground")
+    ground.copies.lose("")
+    robot.runs["camera"] = EPOCH + 1
+    robot.keep("camera", state(EPOCH + 1, 11))
+
+
+def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot, ground):
+    robot.issued["camera"] = 1
+    exchange(robot, ground)
+    before = robot.message()
+    robot.issued["camera"] = 10 * EPOCH
+    taken_over(robot, ground)
+    issued = {"camera": EPOCH + 1}
+    del robot.disk["camera"]  # perhaps it was set aside
+    robot.copies.note_kept("camera", None)
+    ground.keep("camera", state(1, 500))
+    exchange(robot, ground)
+    assert "camera" not in robot.disk, "it runs there, by a higher incarnation"
+    robot.keep("camera", state(EPOCH + 1, 11))
+    ground.receive("", before)  # it was under way all the time
+    assert not ground.copies.is_caught_up(issued)
+    ground.runs["camera"] = 0
+    exchange(robot, ground)
+    assert not ground.copies.is_caught_up(issued)  # it still runs there
+    robot.copies.unsettle(["camera"])
+    robot.runs["camera"] = 0
+    exchange(robot, ground)
+    assert not ground.copies.is_caught_up(issued)  # its process is being ended
+    robot.keep("camera", state(EPOCH + 1, 12))
+    robot.copies.settle("camera")
+    last = robot.message()
+    ground.copies.receive("", last)
+    assert not ground.copies.is_caught_up(issued)  # the last state is not on the disk
+    ground.receive("", last)
+    assert ground.disk["camera"] == state(EPOCH + 1, 12)
+    assert ground.copies.is_caught_up(issued)
+
+
 EVENTS = st.lists(st.one_of(
     st.tuples(st.just("keep"), st.sampled_from(["camera", "hmi"])),
     st.tuples(st.sampled_from(["robot publishes", "ground publishes"]), st.integers(0, 3)),
@@ -172,8 +221,7 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
                         default=None) for node in ("camera", "hmi")}
     robot.runs.clear()
     ground.runs.clear()
-    ground.receive("", robot.message())
-    robot.receive("ground", ground.message())
+    exchange(robot, ground)
     for node, age in newest.items():
         assert age is None or robot.disk[node].age == ground.disk[node].age == age
     assert not robot.problems and not ground.problems  # noqa: PT018

@@ -87,10 +87,13 @@ def test_a_host_that_starts_is_waited_for():
 
 def test_what_a_lost_host_ran_is_taken_over_with_incarnations_that_it_cannot_have_reached():
     made = robot({"hmi": 5 * EPOCH + 1})
+    made.take_table("ground", [row("DM1", 3)], 0.1)
+    assert made.rows() == [row("DM1", 3)]
     assert made.look(LINK.lost_after_s) == Changes()
     assert made.look(LOST_S) == Changes(
         lost=("ground",), take=(("page", 6 * EPOCH), ("modules", EPOCH)))
     assert made.held == {"pilot", "page", "modules"}
+    assert made.rows() == []
     assert made.look(LOST_S + 1) == Changes()
     assert [restarts_of(n) for n in (0, 1, 4, EPOCH + 1, 2 * EPOCH + 3)] == [0, 0, 3, 1, 4]
 
@@ -134,9 +137,12 @@ def test_nothing_is_given_back_to_a_host_that_still_runs_its_own_process():
     assert made.look(6.5) == Changes(back=("ground",))  # no table since
     publish_table(made, 6.7, row("hmi", 1))
     assert made.look(6.7) == Changes(drop=("modules",))
-    publish_table(made, 6.9)
+    modules = [("DM1", "ground", EPOCH + 1), ("DM2", "ground", EPOCH + 1)]
+    assert made.given_back() == modules
+    publish_table(made, 6.9, row("DM1", EPOCH + 2), row("DM2", EPOCH + 1))
     assert made.look(6.9) == Changes(drop=("page",))
     assert made.held == {"pilot"}
+    assert made.given_back() == [("hmi", "ground", EPOCH + 1)], "the home runs what is not there"
 
 
 def test_a_home_ends_its_superseded_process_and_starts_it_again_when_it_is_given_back():
@@ -224,6 +230,17 @@ def test_the_true_offset_lies_within_the_bound(ahead_s, ways, drift):
         true_s = ahead_s + drift * now_s
         assert abs(sync.offset_s - true_s) <= sync.bound_s + 1e-6
         now_s += 0.25
+
+
+def test_the_quickest_way_there_and_the_quickest_way_back_count_together():
+    sync = ClockSync()
+    exchange(sync, 0.0, 100.0, 0.001, 0.4)
+    exchange(sync, 1.0, 100.0, 0.4, 0.001)
+    for second in range(2, 300):
+        exchange(sync, float(second), 100.0, 0.3, 0.3)
+        if second == 50:
+            assert sync.bound_s < 0.25  # on its way: it never jumps
+    assert sync.offset_s == pytest.approx(100.0, abs=0.2)
 
 
 @pytest.mark.parametrize("slow_way", [0, 1])

@@ -591,40 +591,23 @@ class SickPilot(Sick, SafetyPilot):
     pass
 
 
-def restarts_of(
-    policy: RestartPolicy, until_s: float, lasts_s: float = 0.0
-) -> list[tuple[float, bool]]:
-    """Return when a process that always lasts so long is restarted, and whether by an attempt."""
-    now_s, restarts = 0.0, []
-    while now_s < until_s:
-        delay_s = policy.delay_s(now_s)
-        is_attempt = delay_s is None
-        now_s += policy.attempt_in_s(now_s) if delay_s is None else delay_s
-        policy.restarted(now_s)
-        restarts.append((now_s, is_attempt))
-        now_s += lasts_s
-    return restarts
-
-
 def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_apart():
-    restarts = restarts_of(RestartPolicy(), 24 * 3600)
-    free = [at_s for at_s, is_attempt in restarts if not is_attempt]
-    attempts = [at_s for at_s, is_attempt in restarts if is_attempt]
-    assert len(free) == 50
-    assert attempts[0] == pytest.approx(free[0] + 60)
-    gaps = [b - a for a, b in pairwise(attempts)]
-    assert gaps[:4] == [20.0, 40.0, 60.0, 60.0]
-    assert set(gaps[2:]) == {60.0}
-    assert len(attempts) > 24 * 60 - 5  # for as long as the run lasts
-    at_s = [restart for restart, _ in restarts]
-    assert all(at_s[i + 50] - at_s[i] >= 60 for i in range(len(at_s) - 50))
-    policy = RestartPolicy()  # who lasts for a whole period is as good as any other again
-    restarts_of(policy, 100)
-    assert policy.attempts
-    policy.restarted(200)
-    assert policy.delay_s(259) is None
-    assert policy.delay_s(260.1) == 0.0
-    assert policy.attempts == 0
+    policy, now_s, at_s = RestartPolicy(), 0.0, list[float]()
+    for _ in range(50):  # of a process that ends at once
+        now_s += policy.delay_s(now_s)
+        policy.restarted(now_s)
+        at_s.append(now_s)
+    assert policy.delay_s(now_s) is None
+    for _ in range(1000):
+        now_s += policy.attempt_in_s(now_s)
+        policy.restarted(now_s)
+        at_s.append(now_s)
+    assert at_s[50] == pytest.approx(at_s[0] + 60)
+    assert [b - a for a, b in pairwise(at_s[50:])] == [20.0, 40.0] + [60.0] * 997
+    assert all(later - earlier >= 60 for earlier, later in zip(at_s, at_s[50:], strict=False))
+    policy.restarted(now_s + 100)  # who lasts for a whole period is as good as any other again
+    assert policy.delay_s(now_s + 159) is None
+    assert policy.delay_s(now_s + 160.1) == policy.attempts == 0
 
 
 @pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
@@ -777,13 +760,6 @@ def silence(one: SupervisedProcess, now_s: float) -> str:
     return one.silence(now_s, 1.0, lambda: AT_LEISURE)
 
 
-def test_a_new_process_is_silent_when_it_was_not_heard_for_as_long_as_it_may_take():
-    one = process(State.STARTING)
-    one.take(7, 1)
-    assert silence(one, START_TIMEOUT_S - 0.1) == ""
-    assert silence(one, START_TIMEOUT_S + 0.1) == "no heartbeat after its start"
-
-
 @pytest.mark.parametrize(("heard_s", "expected", "excused"), [
     ({"a": 8.0, "b": 10.0}, "no heartbeat from a", ""),
     ({"a": 8.0, "b": 8.0, STATUS: 8.0}, "no heartbeat from a, b", ""),
@@ -792,6 +768,10 @@ def test_a_new_process_is_silent_when_it_was_not_heard_for_as_long_as_it_may_tak
     ({"a": 9.5, "b": 10.0}, "", ""), ({}, "", "")])
 def test_each_node_has_to_be_heard_and_the_manager_s_status_unless_it_could_not_be(
         heard_s, expected, excused):
+    one = process(State.STARTING)
+    one.take(7, 1)
+    assert silence(one, START_TIMEOUT_S - 0.1) == ""
+    assert silence(one, START_TIMEOUT_S + 0.1) == "no heartbeat after its start"
     one = process(State.RUNNING)
     one.take(7, 1)
     one.heard_s = heard_s
