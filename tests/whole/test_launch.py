@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -13,6 +16,7 @@ from rampart.actors.supervision.process_title import find_processes, process_sta
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.real_tools import printed
+from tests.whole.missions import write_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(240)]
 
@@ -65,3 +69,29 @@ def test_other_runs_and_ctrl_z_do_not_disturb_a_run_and_a_dead_mission_manager_l
     assert result["restarts"]["mission_manager"] == 1
 
 
+def test_after_a_pause_of_everybody_only_what_died_or_hangs_is_restarted(tmp_path):
+    """The launcher is stopped first, and all go on in a random order, but for the supervisor."""
+    def running() -> set[tuple[tuple[str, ...], int]]:
+        return {(p.names, p.incarnation) for p in find_processes(run.port) if p.names != ("pool",)}
+
+    mission = write_mission(tmp_path, "NEAR")
+    with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:
+        run.sleep_until(4.0)
+        before, supervisor = running(), run.pid("supervisor")
+        died, hangs = run.pid("graph_planner"), run.pid("DM5")
+        pids = [run.process.pid, *(p.pid for p in find_processes(run.port)
+                                   if p.pid != run.process.pid)]
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(3.0)
+        os.kill(died, signal.SIGKILL)
+        random.Random(7).shuffle(pids)
+        for pid in sorted(set(pids) - {hangs}, key=supervisor.__eq__):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+            time.sleep(0.002)
+        run.wait_for("goal 3/3")
+        assert running() - before == {(("graph_planner",), 2), (("DM5",), 2)}, run.story
+        _, result = run.result()
+        assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
+        assert "latched" not in run.story
