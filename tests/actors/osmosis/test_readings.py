@@ -27,7 +27,7 @@ from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from tests.actors.osmosis.control.laser_sweeps import RAYS, full_sweep
 from tests.osmosis_system import shipped_system
-from tests.whole.missions import write_near_mission
+from tests.whole.missions import write_mission
 
 REACH = reach_of(shipped_system())
 NO_RAY = [0.0, -1.0, math.nan, 0.01, 8.5]
@@ -155,7 +155,7 @@ def test_readings_beyond_what_a_device_can_say_are_none():
     *(pytest.param("osmosis", f"{way}:summit_xl/{laser}@5+inf", marks=pytest.mark.slow)
       for way, laser in (("zero", "upper_scan"), ("negative", "scan"), ("nan", "upper_scan")))])
 def test_a_laser_of_nonsense_costs_two_lasers_nothing_and_one_a_stop(tmp_path, system, fault):
-    mission = str(write_near_mission(tmp_path))  # an obstacle is on its way
+    mission = str(write_mission(tmp_path, "NEAR"))  # an obstacle is on its way
     result = run_job(Job(row="x", system=system, options={"mission": mission, "obstacles": 2},
                          seed=3, faults=(parse_fault(fault),)))
     assert result.effective
