@@ -1,6 +1,6 @@
 """Chaos on real processes: `make chaos`, `make chaos-pairs` and `make soak`; some of it in tests.
 
-    python -m tests.whole.chaos ways|pairs|soak [--seed N] [--rate R] [--file FILE] [--hours H]
+    python -m tests.whole.chaos ways|pairs|soak [--seed N] [--file FILE] [--hours H]
 
 ways     every process in every way
 pairs    every pair of processes at once; those with the supervisor or the root in all combinations
@@ -56,6 +56,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
 from rampart.actors.bus.run_folder import ROUTERS
@@ -422,47 +423,29 @@ def usage(run: RealRun) -> dict[str, tuple[float, ...]]:
     return used
 
 
-def rise(samples: Iterable[tuple[int, float, float]], counts: float) -> float:
-    """Return by how much a figure grows in an hour; 0 if that is no more than chance, or counts.
-
-    Args:
-        samples: Mission, seconds into it, and value.
-        counts: By how much in an hour it may grow.
-    """
-    missions: dict[int, list[tuple[float, float]]] = defaultdict(list)
-    for mission, into_s, value in samples:
-        if into_s >= WARM_UP_S:
-            missions[mission].append((into_s / 3600, value))
-    around = []
-    for points in missions.values():
-        hour, level = (statistics.fmean(column) for column in zip(*points, strict=True))
-        around += [(t - hour, value - level) for t, value in points]
-    if len({t for t, _ in around}) < 2 or len({value for _, value in around}) < 2:
-        return 0.0
-    times, values = zip(*around, strict=True)
-    slope = statistics.linear_regression(times, values).slope
-    is_clear = statistics.correlation(times, values) > CLEAR
-    return slope if is_clear and slope > counts else 0.0
-
-
 def growths(records: Sequence[Record]) -> list[str]:
     """Return which figures grow: of all processes together, of the root, and of the others.
 
     The two routers count as one: all clients are of one of them, and change over when it is killed.
     """
-    samples = [r for r in records if r["kind"] == "sample"]
-    names = {name for r in samples for name in r["used"]} - set(ROUTERS)
+    samples = [r for r in records if r["kind"] == "sample" and r["into_s"] >= WARM_UP_S]
+    names = sorted({name for r in samples for name in r["used"]} - set(ROUTERS))
+    members = {"all": (*names, *ROUTERS), "routers": ROUTERS, **{name: (name,) for name in names}}
     found = []
-    for what in ("all", "routers", *sorted(names)):
-        for place, counts in enumerate(COUNTS.get(what, ONE)):
-            values = []
-            for r in samples:
-                members = {"all": r["used"], "routers": ROUTERS}.get(what, (what,))
-                if r["used"].keys() >= set(members):
-                    values.append((r["mission"], r["into_s"],
-                                   sum(r["used"][name][place] for name in members)))
-            if grown := rise(values, counts):
-                found.append(f"{what}: {FIGURES[place]} grow by {grown:.1f} an hour")
+    for what, place in product(members, range(len(FIGURES))):
+        missions: dict[int, list[tuple[float, float]]] = defaultdict(list)
+        for r in samples:
+            there = [r["used"][name][place] for name in members[what] if name in r["used"]]
+            if len(there) == len(members[what]):
+                missions[r["mission"]].append((r["into_s"] / 3600, sum(there)))
+        around = [np.array(points) - np.mean(points, axis=0) for points in missions.values()]
+        hours, values = np.concatenate(around).T if around else np.zeros((2, 1))
+        if not hours.any() or not values.any():
+            continue
+        an_hour = np.polyfit(hours, values, 1)[0]
+        is_clear = np.corrcoef(hours, values)[0, 1] > CLEAR
+        if is_clear and an_hour > COUNTS.get(what, ONE)[place]:
+            found.append(f"{what}: {FIGURES[place]} grow by {an_hour:.1f} an hour")
     return found
 
 
@@ -548,12 +531,12 @@ def one_mission(log: Log, options: argparse.Namespace, strikes: Sequence[Strike]
         nonlocal sampled_s
         if is_soak and time.monotonic() - sampled_s >= SAMPLE_S:
             sampled_s = time.monotonic()
-            keep("sample", into_s=round(chaos.now_s() / options.rate, 2), used=usage(run))
+            keep("sample", into_s=round(chaos.now_s(), 2), used=usage(run))
 
     keep("begin")
     directory.mkdir(parents=True, exist_ok=True)
     with RealRun(directory, SYSTEM, "--mission", str(write_laps(directory, options.laps)),
-                 "--rate", f"{options.rate:g}", "--hmi-port", str(free_base_port()), "--patience",
+                 "--hmi-port", str(free_base_port()), "--patience",
                  "90", "--seed", str(options.seed + number),
                  *(word for fault in faults for word in ("--fault", fault.text())),
                  hmi=True) as run:
@@ -600,22 +583,12 @@ def session(log: Log, options: argparse.Namespace) -> None:
         is_well = one_mission(log, options, strikes, faults)
 
 
-def spread(seconds: Iterable[float | None]) -> str:
-    """Return median and maximum in milliseconds."""
-    known = [s for s in seconds if s is not None]
-    if not known:
-        return "nothing"
-    return (f"median {1e3 * statistics.median(known):.0f} ms, at most {1e3 * max(known):.0f} ms "
-            f"({len(known)})")
-
-
 def main() -> int:
     """Run what was asked for and return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("ways", "pairs", "soak"))
     parser.add_argument("--seed", type=int, default=1, help="of the plan (default: 1)")
-    parser.add_argument("--rate", type=float, default=1.0, help="simulated seconds per second")
     parser.add_argument("--file", type=Path, help="JSON lines of what was done")
     parser.add_argument("--hours", type=float, default=1.0, metavar="H",
                         help="how long the soak in the file is to last in all (default: 1)")
@@ -632,7 +605,9 @@ def main() -> int:
         f"emergency stop, {len(missions)} missions: "
         + ", ".join(f"{count} {verdict}" for verdict, count in Counter(
             m["verdict"] for m in missions).items()))
-    say(f"back after a hit: {spread(hit['back_s'] for hit in hits)}")
+    back_s = [hit["back_s"] for hit in hits if hit["back_s"] is not None] or [0.0]
+    say(f"{len(hits)} strikes, all back after {statistics.median(back_s):.2f} s (median), at most "
+        f"{max(back_s):.2f} s")
     wrong = log.wrong()
     for line in wrong:
         say(f"WRONG {line}")
