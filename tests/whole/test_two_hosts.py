@@ -224,19 +224,6 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
     assert all("was superseded by 1000001" in line for line in refused)
 
 
-def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_path):
-    spec, other = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1), tmp_path / "other.toml"
-    other.write_text(spec.read_text().replace("intensity", "# intensity").replace(
-        "Pick and place", "Pick or place"), encoding="utf-8")
-    with (host(net, "robot", tmp_path / "r", spec, "--no-keys") as robot,
-          host(net, "ground", tmp_path / "g", other, "--no-keys") as ground):
-        assert ground.process.wait(30) == 2
-        assert "--host ground: specification: not the same as on the first host" in ground.story
-        robot.wait_for("waiting for ground: rampart run --host ground there")
-        robot.process.send_signal(signal.SIGINT)
-        robot.process.wait(10)
-
-
 ON_GROUND, ON_DESK = ("camera",), ("part_finder", "D_VISION_CRASH")
 DELAY_S = 0.08
 BEGINS_S = 6.0
