@@ -34,8 +34,6 @@ from rampart.actors.supervision import node_process
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
-from rampart.cli import systems
-from rampart.cli.analyse.check_verbs import explain
 from rampart.cli.operate import kill_node
 from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
@@ -72,17 +70,32 @@ class Witness(Actor):
         return next(((r.state.value, r.incarnation) for r in self.table.nodes if r.name == node),
                     ("unknown", 0))
 
+    def runs_above(self, node: str, incarnation: int) -> bool:
+        state, now = self.state(node)
+        return state == "running" and now > incarnation
+
     def pid(self, node: str) -> int:
         return next(r.pid for r in self.table.nodes if r.name == node)
 
     @asynccontextmanager
-    async def comes_back(self, *nodes: str, within_s: float = 10.0) -> AsyncIterator[None]:
-        """Wait until the next incarnations run of what the body of the context has hurt."""
+    async def comes_back(self, *nodes: str, alone: bool = False) -> AsyncIterator[None]:
+        """Wait until the next incarnations run of what the body of the context has hurt.
+
+        If they come back alone, all others are the same processes as before.
+        """
         next_ones = {node: ("running", self.state(node)[1] + 1) for node in nodes}
+        before = self.pids()
         self.events.clear()
         yield
         await eventually(lambda: all(self.state(n) == one for n, one in next_ones.items()),
-                         within_s, f"not back: {nodes}")
+                         10.0, f"not back: {nodes}")
+        if alone:
+            await eventually(self.all_run)
+            assert {n for n, pid in self.pids().items() if pid != before[n]} == set(nodes)
+
+    def kill(self, *nodes: str) -> None:
+        for node in nodes:
+            os.kill(self.pid(node), signal.SIGKILL)
 
     def pids(self) -> dict[str, int]:
         return {row.name: row.pid for row in self.table.nodes}
@@ -202,22 +215,17 @@ async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permit
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 async def test_the_supervisor_comes_back_and_adopts_the_living(witness, port, number):
-    before = witness.pids()
-    async with witness.comes_back("supervisor"):
+    async with witness.comes_back("supervisor", alone=True):
         os.kill(process(port, "supervisor"), number)
-    await eventually(witness.all_run)
-    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"supervisor"}
 
 
 async def test_a_supervisor_that_stood_still_for_a_while_blames_nobody_for_it(witness, port):
-    before = witness.pids()
     supervisor = process(port, "supervisor")
-    async with witness.comes_back("DM3"):
+    async with witness.comes_back("DM3", alone=True):
         os.kill(supervisor, signal.SIGSTOP)
         await asyncio.sleep(0.9)  # longer than a heartbeat may be missing, but not for the launcher
         os.kill(supervisor, signal.SIGCONT)
         os.kill(witness.pid("DM3"), signal.SIGSTOP)  # and it still sees who does stand still
-    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"DM3"}
     assert {e.node for e in witness.events if e.event in {"stopped", "wedged"}} == {"DM3"}
 
 
@@ -233,10 +241,8 @@ async def test_with_the_supervisor_and_both_routers_gone_all_three_come_back(wit
 
 
 async def test_a_stopped_router_is_replaced_and_costs_no_node_its_process(witness):
-    before = witness.pids()
-    async with witness.comes_back("router_a"):
+    async with witness.comes_back("router_a", alone=True):
         os.kill(witness.pid("router_a"), signal.SIGSTOP)
-    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"router_a"}
 
 
 async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(witness, port, capsys):
@@ -357,13 +363,8 @@ async def test_without_a_pool_the_next_supervisor_is_forked_and_no_node_is_start
     _, before = witness.state("supervisor")
     for pid in (*there, process(port, "supervisor")):
         os.kill(pid, signal.SIGKILL)
-
-    def is_back():  # one that was dying may have taken the request
-        state, incarnation = witness.state("supervisor")
-        return state == "running" and incarnation > before
-
-    await eventually(is_back)
-    assert nodes <= {p.pid for p in find_processes(port)}
+    await eventually(lambda: witness.runs_above("supervisor", before))
+    assert nodes <= {p.pid for p in find_processes(port)}, "one that was dying took the request"
 
 
 @pytest.mark.alone
@@ -371,8 +372,7 @@ async def test_a_supervisor_that_dies_with_requests_under_way_leaves_one_process
         witness, port):
     for life in range(2, 6):
         async with witness.comes_back("supervisor"):
-            for name in ("DM1", "DM2", "DM3"):
-                os.kill(witness.pid(name), signal.SIGKILL)
+            witness.kill("DM1", "DM2", "DM3")
             await asyncio.sleep(0.002 * life)
             os.kill(process(port, "supervisor"), signal.SIGKILL)
         await eventually(witness.all_run)
@@ -384,11 +384,10 @@ async def test_a_supervisor_that_dies_with_requests_under_way_leaves_one_process
 async def test_what_dies_is_made_of_the_pool_and_a_node_without_a_spare_is_forked(witness, port):
     there = await filled(port)
     async with witness.comes_back("safety_pilot"):
-        os.kill(witness.pid("safety_pilot"), signal.SIGKILL)
+        witness.kill("safety_pilot")
     assert witness.pid("safety_pilot") not in there
     async with witness.comes_back("DM1", "DM2"):
-        for name in ("DM1", "DM2"):  # together
-            os.kill(witness.pid(name), signal.SIGKILL)
+        witness.kill("DM1", "DM2")  # together
     assert {witness.pid("DM1"), witness.pid("DM2")} == there
     there = await filled(port)
     async with witness.comes_back("supervisor"):
@@ -403,9 +402,8 @@ async def test_a_process_of_the_pool_that_cannot_become_a_node_costs_only_itself
         there, life = await filled(port, {witness.pid("DM1")}), witness.state("DM1")[1]
         for pid in there:
             os.kill(pid, hurt)
-        os.kill(witness.pid("DM1"), signal.SIGKILL)
-        await eventually(lambda n=life: witness.state("DM1")[0] == "running"
-                         and witness.state("DM1")[1] > n)
+        witness.kill("DM1")
+        await eventually(lambda n=life: witness.runs_above("DM1", n))
         assert witness.pid("DM1") not in there
     there = await filled(port, there)
     for hurt in HURTS:  # it is replaced though no node needs it
@@ -523,8 +521,6 @@ async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped
 async def test_a_stopped_watching_process_is_continued_and_without_it_the_verdict_is_not_known(
         tmp_path):
     async with started(tmp_path) as (root, port):
-        described = {p.name for p in explain(systems.check(str(tmp_path / "stub.toml"))).processes}
-        assert {"+".join(p.names) for p in find_processes(port)} <= described
         pid = process(port, "run")
         os.kill(pid, signal.SIGSTOP)
         await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)
