@@ -9,7 +9,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from rampart import Arbiter, Context, SpecificationError, parse_specification, verify
+from rampart import Arbiter, Context, verify
 from rampart.actors.ftm import messages as fm
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.supervision.node_process import OF_A_PART
@@ -19,7 +19,7 @@ from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.clearing import reset_role
 from rampart.testing import run
-from tests.manager.bench import PAPER, RMS, Bench, Managed, edited, full_system
+from tests.manager.bench import RMS, Bench, Managed, edited, full_system
 
 
 def bench(**fields) -> Bench:
@@ -95,28 +95,6 @@ def test_a_manager_that_is_started_again_knows_since_when_the_error_is_gone():
 def test_a_memory_with_an_impossible_time_is_refused():
     assert objection(Memory(1, held=(("FTM2", math.nan, 0.0),))) == \
         "FTM2 is held since nan s, seen at 0.0 s"
-
-
-def written(fields: str, name: str = "FTM2") -> str:
-    head, _, rest = PAPER.partition(f'name = "{name}"\n')
-    text = f'{head}name = "{name}"\n{fields}\n{rest}'
-    return text.replace("checkpoints = false", "checkpoints = true")
-
-
-@pytest.mark.parametrize(("text", "words"), [
-    (written('clears = "sometimes"'), "clears = 'sometimes'"),
-    (written('clears = "by itself"', "FTM1"), "RM1 is latched; expected 'by operator' or 'never'"),
-    (written('cleared_by = "inject"'), "expected only if it clears by operator"),
-    (written('cleared_by = "look"'), "expected 'drive' or 'inject'"),
-    (written('clears = "never"\nclear_after_s = 3'), "expected only if it clears"),
-    (written("clear_after_s = -1"), "expected a number, 0 or more"),
-    (written('clears = "never"').replace("checkpoints = true", "checkpoints = false"),
-     "expected checkpoints = true in [layers]"),
-])
-def test_contradictions_are_refused_at_load(text, words):
-    with pytest.raises(SpecificationError) as refused:
-        parse_specification(text, "paper.toml")
-    assert words in str(refused.value)
 
 
 def test_a_recovery_needs_the_highest_role_of_its_mechanisms():

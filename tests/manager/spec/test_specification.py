@@ -163,6 +163,18 @@ REFUSED = {
 }
 
 
+KEPT = ("checkpoints = false", "checkpoints = true")
+REFUSED |= {words: [(f'name = "{name}"\n', f'name = "{name}"\n{fields}\n'), *kept]
+            for words, name, fields, kept in (
+    ("clears = 'sometimes'", "FTM2", 'clears = "sometimes"', [KEPT]),
+    ("RM1 is latched; expected 'by operator' or 'never'", "FTM1", 'clears = "by itself"', [KEPT]),
+    ("expected only if it clears by operator", "FTM2", 'cleared_by = "inject"', [KEPT]),
+    ("expected 'drive' or 'inject'", "FTM2", 'cleared_by = "look"', [KEPT]),
+    ("expected only if it clears", "FTM2", 'clears = "never"\nclear_after_s = 3', [KEPT]),
+    ("expected a number, 0 or more", "FTM2", "clear_after_s = -1", [KEPT]),
+    ("expected checkpoints = true in [layers]", "FTM2", 'clears = "never"', []))}
+
+
 @pytest.mark.parametrize("words", REFUSED)
 def test_refused(words):
     assert words in refusal(edit(*REFUSED[words]))
