@@ -46,8 +46,6 @@ def test_a_version_that_makes_no_sense_is_refused(release, version, reason):
         release.edited(version, datetime.date(2030, 1, 2))
 
 
-
-
 def test_the_command_line_prints_the_version_of_the_project(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["--version"])

@@ -154,14 +154,11 @@ def answering(answer: bytes) -> Iterator[int]:
 INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", "", (), "r", 0, "a run")
 
 
-def test_a_socket_of_another_user_is_not_a_launcher(monkeypatch):
-    monkeypatch.setattr(run_info, "is_same_user", lambda _connection: False)
-    with answering(msgspec.json.encode(INFO)) as port:
-        assert run_info.ask(port) is None
-
-
-@pytest.mark.parametrize("answer", [b"nothing", b"{}", b'{"title": "\xff"}'])
-def test_an_invalid_answer_is_not_a_run(answer):
+@pytest.mark.parametrize("answer", [b"nothing", b"{}", b'{"title": "\xff"}', "another user's"])
+def test_an_invalid_answer_and_a_socket_of_another_user_are_no_run(monkeypatch, answer):
+    if isinstance(answer, str):
+        answer = msgspec.json.encode(INFO)
+        monkeypatch.setattr(run_info, "is_same_user", lambda _connection: False)
     with answering(answer) as port:
         assert run_info.ask(port) is None
 

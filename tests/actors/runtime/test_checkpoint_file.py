@@ -72,11 +72,11 @@ def states(of: FileCheckpoints) -> list[bytes]:
     return [record.state for record in of.load().records]
 
 
-def counted(folder: Path, last: int = 6, length: int = 4) -> Path:
-    """Keep some states of about a length, and return the file of the newest."""
+def counted(folder: Path) -> Path:
+    """Keep six states, and return the file of the newest."""
     store = FileCheckpoints(folder, "node", "run", 1, syncs=False)
-    for number in range(1, last + 1):
-        store.save(1, 0, FORM.encode(Counter(number, label="x" * length)))
+    for number in range(1, 7):
+        store.save(1, 0, FORM.encode(Counter(number)))
     store.close()
     return newest(folder)
 
