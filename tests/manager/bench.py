@@ -23,16 +23,12 @@ from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 from rampart.testing import VirtualSystem
 from tests.osmosis_system import run_context
+from tests.osmosis_system import shipped_system as paper
 
 PAPER, FULL = ((systems.SHIPPED / name).read_text(encoding="utf-8")
                for name in ("paper.toml", "osmosis.toml"))
 DMS = ("DM1", "DM2", "DM3", "DM4", "DM5", "DM6", "DM7")
 RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")
-
-
-@cache
-def paper() -> SystemSpec:
-    return parse_specification(PAPER, "systems/paper.toml")
 
 
 @cache

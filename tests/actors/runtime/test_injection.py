@@ -145,13 +145,16 @@ def test_a_share_of_the_messages_is_affected_and_nothing_but_the_seed_says_which
 
 
 def test_noise_has_the_spread_it_was_ordered_with_and_comes_from_the_seed():
-    def noise(seed: int) -> list[float]:
+    def noise(seed: int) -> np.ndarray:
         faults = gate("corrupt", noise_fields={"x_m": 0.5}, seed=seed)
-        return [faults.apply(KEY, POSE, 11.0, 11.0).body.x_m - 1.0 for _ in range(3000)]
+        return np.array([faults.apply(KEY, POSE, 11.0, 11.0).body.x_m for _ in range(3000)])
 
-    assert noise(1) == noise(1) != noise(2)
-    assert np.mean(noise(1)) == pytest.approx(0.0, abs=4 * 0.5 / math.sqrt(3000))
-    assert np.std(noise(1)) == pytest.approx(0.5, rel=0.06)
+    of_an_array = ranges(corrupted(scan([1.0] * 3000), noise_fields={"ranges_f32": 0.5}, seed=1))
+    assert noise(1).tolist() == noise(1).tolist() != noise(2).tolist()
+    for found in (noise(1), of_an_array):
+        assert len(set(found.tolist())) > 2900
+        assert np.mean(found) == pytest.approx(1.0, abs=4 * 0.5 / math.sqrt(3000))
+        assert np.std(found) == pytest.approx(0.5, rel=0.06)
 
 
 # -- corruption of each kind of field ------------------------------------------------------------
@@ -199,12 +202,6 @@ def test_an_array_is_filled_ramped_and_biased_element_by_element(values, fill, r
         assert after.range_max_m == before.range_max_m
 
 
-def test_the_noise_of_an_array_differs_from_element_to_element():
-    after = ranges(corrupted(scan([4.0] * 2000), noise_fields={"ranges_f32": 0.3}, seed=1))
-    assert len(set(after.tolist())) > 1900
-    assert np.std(after) == pytest.approx(0.3, rel=0.08)
-
-
 @given(st.floats())
 @example(math.nextafter(math.pi, 4))
 @example(math.nextafter(-math.pi, -4))
@@ -239,15 +236,6 @@ def test_a_message_that_leaves_as_it_came_is_not_affected(mode, fields, affected
     assert faults.expire("i") == affected
 
 
-def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
-    faults = gate("drop")
-    sent(faults, [11.0, 12.0])
-    assert faults.order(Injection("i", "localization/pose", "duplicate", 5.0), 12.0) == ""
-    assert sent(faults, [13.0]) == [(13.0, 13.0, 0.0, 2)]
-    assert faults.expire("i") == 3
-    assert faults.expire("i") == 0
-
-
 # -- what is refused -----------------------------------------------------------------------------
 
 
@@ -257,10 +245,8 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     ("delay", {"delay_s": math.inf}, "delay_s = inf"),
     ("delay", {}, "delay_s = 0"),
     ("restamp", {}, "stamp_s = 0"),
-    ("drop", {"stamp_s": -math.inf}, "stamp_s = -inf"),
     ("drop", {"share": math.nan}, "share = nan"),
     ("drop", {"on_s": 1.0}, "on_s = 1, off_s = 0"),
-    ("drop", {"on_s": math.inf, "off_s": 1.0}, "on_s = inf"),
     ("drop", {"topic": "inject/report"}, "topic = 'inject/report'"),
     ("corrupt", {}, "mode = 'corrupt'"),
     ("corrupt", {"add_fields": {"x_m": math.inf}}, "add_fields 'x_m' = inf"),
@@ -282,14 +268,11 @@ def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode,
 
 
 @pytest.mark.parametrize(("kind", "fields", "fits"), [
-    (LaserScan, {"set_fields": {"ranges_f32": b"1234"}}, True),
     (LaserScan, {"set_fields": {"ranges_f32": True}}, False),
     (Route, {"add_fields": {"step": 1.0}}, True),
     (Route, {"ramp_fields": {"step": 1.0}}, False),
     (Route, {"add_fields": {"active": 1.0}}, False),
     (Route, {"noise_fields": {"waypoints": 1.0}}, True),
-    (Route, {"set_fields": {"mode": "flying"}}, False),
-    (MissionRequest, {"ramp_fields": {"goals.x_m": 1.0}}, True),
 ])
 def test_whether_a_change_fits_is_known_from_the_type_of_the_field(kind, fields, fits):
     assert (flaw(Injection("i", "t", "corrupt", 1.0, **fields), kind) == "") == fits
