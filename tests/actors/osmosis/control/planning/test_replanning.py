@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+from itertools import groupby
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,10 +23,8 @@ from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
 from rampart.actors.osmosis.control.planning.route_search import without
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import Mode
-from rampart.actors.runtime.actor import Actor, on
-from rampart.testing import run
 from tests.actors.osmosis.control.world import Circle, World, drive
-from tests.osmosis_system import System
+from tests.osmosis_system import System, in_system
 
 AIRPORT = load_airport("vallombre")
 RING = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}
@@ -120,45 +121,37 @@ def test_else_it_waits_and_touches_nothing(follower, aside_m):
 
 # ---- the planner as an actor --------------------------------------------------------------------
 
-
-class Chain(Actor):
-    """The nodes around the planner."""
-
-    outputs = (topics.POSE, topics.GOAL, topics.CONTROL_STATUS)
-
-    def __init__(self, context):
-        super().__init__(context)
-        self.routes = []
-
-    @on(topics.ROUTE)
-    def route(self, message, header):
-        if not self.routes or message != self.routes[-1]:
-            self.routes.append(message)
-
-    def blocked(self, x_m, y_m, step=0, for_s=20.0):
-        now_s = self.clock.now()
-        self.publish(topics.CONTROL_STATUS, m.ControlStatus(
-            "m1", step, m.ControlPhase.WAITING, 0, 20.0,
-            (m.Blockage(x_m, y_m, now_s - for_s),)))
-
-
 ORDER = m.GoalOrder("m1", 0, m.Goal(-22.0, -18.5, Mode.TAXI), True)
 CRATE = (-29.3, -5.0)
 
 
-def planned(scenario, **parameters):
-    async def play():
-        async with System(airport=AIRPORT) as system:
-            chain = system.start("chain", Chain)
-            system.start("graph_planner", GraphPlanner, **parameters)
-            await system.settle()
-            chain.publish(topics.POSE, m.Pose(-29.4, -3.6, -math.pi / 2))
-            chain.publish(topics.GOAL, ORDER)
-            await asyncio.sleep(0.1)
-            await scenario(chain)
-            return chain.routes
+class Planned:
+    """The planner with the robot at the start of a route past the crate."""
 
-    return run(play)
+    def __init__(self, system: System, **parameters: float) -> None:
+        self.system, self.heard = system, system.hear(topics.ROUTE)
+        system.start("graph_planner", GraphPlanner, **parameters)
+
+    async def begin(self) -> None:
+        await self.system.settle()
+        self.system.say(topics.POSE, m.Pose(-29.4, -3.6, -math.pi / 2))
+        await self.order()
+
+    async def order(self, **changes: Any) -> None:
+        self.system.say(topics.GOAL, msgspec.structs.replace(ORDER, **changes))
+        await asyncio.sleep(0.1)
+
+    async def blocked(self, x_m: float, y_m: float, *, step: int = 0, for_s: float = 20.0,
+                      mission: str = "m1") -> None:
+        since_s = self.system.clock.now() - for_s
+        self.system.say(topics.CONTROL_STATUS, m.ControlStatus(
+            mission, step, m.ControlPhase.WAITING, 0, 20.0, (m.Blockage(x_m, y_m, since_s),)))
+        await asyncio.sleep(0.3)
+
+    @property
+    def routes(self) -> list[m.Route]:
+        """The routes in sequence, repetitions left out."""
+        return [route for route, _ in groupby(heard.message for heard in self.heard)]
 
 
 def passes(route, place):
@@ -167,58 +160,44 @@ def passes(route, place):
         for a, b in itertools.pairwise(route.waypoints))
 
 
-def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough():
-    async def scenario(chain):
-        chain.blocked(*CRATE, for_s=15.0)
-        await asyncio.sleep(0.3)
-        assert len(chain.routes) == 1
-        chain.blocked(*CRATE, for_s=16.5)
-        await asyncio.sleep(0.3)
-
-    direct, detour = planned(scenario, replan_after_s=16.0)
+@in_system(airport=AIRPORT)
+async def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough(system):
+    planned = Planned(system, replan_after_s=16.0)
+    await planned.begin()
+    await planned.blocked(*CRATE, for_s=15.0)
+    assert len(planned.routes) == 1
+    await planned.blocked(*CRATE, for_s=16.5)
+    direct, detour = planned.routes
     assert passes(direct, CRATE)
     assert not passes(detour, CRATE)
     assert detour.waypoints[-1] == direct.waypoints[-1]
     assert detour.reason == "route around (-29.3, -5.0), which is blocked"
-
-
-def test_the_place_is_avoided_for_later_goals_too_and_then_tried_again():
-    async def scenario(chain):
-        chain.blocked(*CRATE)
-        for step in (1, 2):
-            await asyncio.sleep(31.0)
-            chain.publish(topics.GOAL, m.GoalOrder("m1", step, ORDER.goal, True))
-        await asyncio.sleep(0.1)
-
-    _, _, soon, late = planned(scenario, replan_after_s=16.0, avoid_for_s=60.0)
+    for step in (1, 2):  # avoided for later goals, too, and then tried again
+        await asyncio.sleep(31.0)
+        await planned.order(step=step)
+    _, _, soon, late = planned.routes
     assert not passes(soon, CRATE)
     assert passes(late, CRATE)
 
 
-def test_without_another_way_and_after_reports_of_something_else_the_route_stays():
-    async def scenario(chain):
-        for mission, step, x_m in (("m2", 0, CRATE[0]), ("m1", 1, CRATE[0]), ("m1", 0, math.nan)):
-            chain.publish(topics.CONTROL_STATUS, m.ControlStatus(
-                mission, step, m.ControlPhase.WAITING, 0, 9.0,
-                (m.Blockage(x_m, CRATE[1], -99.0),)))
-            await asyncio.sleep(0.3)
-        chain.publish(topics.GOAL, m.GoalOrder("m1", 1, m.Goal(-29.4, -3.3, Mode.TAXI), True))
-        await asyncio.sleep(0.1)
-        chain.blocked(-29.4, -3.3, step=1)
-        await asyncio.sleep(0.3)
-
-    routes = planned(scenario, replan_after_s=16.0, avoid_gap_m=30.0)
-    assert [route.step for route in routes] == [0, 1]
+@in_system(airport=AIRPORT)
+async def test_without_another_way_and_after_reports_of_something_else_the_route_stays(system):
+    planned = Planned(system, replan_after_s=16.0, avoid_gap_m=30.0)
+    await planned.begin()
+    for mission, step, x_m in (("m2", 0, CRATE[0]), ("m1", 1, CRATE[0]), ("m1", 0, math.nan)):
+        await planned.blocked(x_m, CRATE[1], step=step, mission=mission, for_s=99.0)
+    await planned.order(step=1, goal=m.Goal(-29.4, -3.3, Mode.TAXI))
+    await planned.blocked(-29.4, -3.3, step=1)
+    assert [route.step for route in planned.routes] == [0, 1]
 
 
-def test_another_plan_that_is_asked_for_avoids_what_is_in_the_way():
-    async def scenario(chain):
-        chain.blocked(*CRATE, for_s=4.0)
-        await asyncio.sleep(0.1)
-        chain.publish(topics.GOAL, m.GoalOrder("m1", 0, ORDER.goal, True, 1))
-        await asyncio.sleep(0.1)
-
-    direct, detour = planned(scenario)
+@in_system(airport=AIRPORT)
+async def test_another_plan_that_is_asked_for_avoids_what_is_in_the_way(system):
+    planned = Planned(system)
+    await planned.begin()
+    await planned.blocked(*CRATE, for_s=4.0)
+    await planned.order(plan=1)
+    direct, detour = planned.routes
     assert passes(direct, CRATE)
     assert not passes(detour, CRATE)
     assert (direct.plan, detour.plan) == (0, 1)
