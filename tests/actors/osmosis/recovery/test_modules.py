@@ -1,4 +1,4 @@
-"""RM1 to RM5 as actors: obedience, reports, and what they do to base, pilot and supervisor."""
+"""RM1 to RM5, RM7 and RM8 as actors: what they do to base, pilot and supervisor."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
 from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
+from rampart.actors.osmosis.recovery.reduced_speed import ReducedSpeed
+from rampart.actors.osmosis.recovery.respawn_braked import RespawnBraked
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor
@@ -113,8 +115,8 @@ async def test_the_pilot_is_ordered_until_released(system, cls, mode):
         boss.order("RM", reason="DM2: command not updated")
         await system.settle()
     assert pilot.heard == 1
-    assert pilot.mode is mode
-    assert pilot.orders["RM"].reason == "DM2: command not updated"
+    assert pilot.gate.mode is mode
+    assert pilot.gate.orders["RM"].reason == "DM2: command not updated"
     boss.order("RM", decision=2)
     await system.settle()
     assert boss.phases == ["idle", "acting", "degraded"]
@@ -124,7 +126,7 @@ async def test_the_pilot_is_ordered_until_released(system, cls, mode):
     assert pilot.heard == pytest.approx(7, abs=1)
     boss.release("RM")
     await system.settle()
-    assert pilot.mode is PilotMode.AUTO
+    assert pilot.gate.mode is PilotMode.AUTO
     await asyncio.sleep(3.0)
     assert boss.phases == ["idle", "acting", "degraded", "idle"]
     assert pilot.heard == pytest.approx(13, abs=1)
@@ -163,7 +165,7 @@ async def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard(system
     await system.kill("a")
     boss.order("RM3", nodes=("a",))
     await system.settle()
-    assert [(r.node, r.failed_incarnation, r.by) for _, r in supervisor.requests] == [
+    assert [(r.node, r.failed_incarnation, r.by) for r in supervisor.requests] == [
         ("a", 1, "RM3")]
     assert boss.phases == ["idle", "acting"]
     await asyncio.sleep(0.1)
@@ -179,10 +181,103 @@ async def test_a_supervisor_that_is_away_is_asked_until_the_deadline(system):
     await system.kill("a")
     boss.order("RM3", nodes=("a",))
     await asyncio.sleep(1.9)
-    assert len({r.request for _, r in supervisor.requests}) == 1
+    assert len({r.request for r in supervisor.requests}) == 1
     assert len(supervisor.requests) == pytest.approx(10, abs=1)
     await asyncio.sleep(0.2)
     assert boss.reports[-1].message.reason == "not done within 2 s: a"
     supervisor.answer = "respawned"
     await asyncio.sleep(0.5)
     assert boss.phases == ["idle", "acting", "failed", "done"]
+
+
+# ---- RM7, RM8 ----------------------------------------------------------------------------------
+
+
+async def braking(system: System) -> tuple[Boss, Base, Supervisor]:
+    boss, base = Boss(system), system.start("base", Base)
+    supervisor = system.start("supervisor", Supervisor)
+    system.start("safety_pilot", Node)
+    system.start("RM1", EmergencyStop)
+    system.start("RM7", RespawnBraked, nodes=["safety_pilot"])
+    await asyncio.sleep(0.5)
+    return boss, base, supervisor
+
+
+@in_system()
+async def test_a_pilot_that_lives_but_is_accused_is_respawned_with_the_brake_held(system):
+    boss, base, supervisor = await braking(system)
+    boss.order("RM7", nodes=("safety_pilot#1",))
+    await system.settle()
+    assert base.engaged
+    assert [r.failed_incarnation for r in supervisor.requests] == [1]
+    await asyncio.sleep(0.5)
+    assert system.incarnations["safety_pilot"] == 2
+    assert not base.engaged
+    boss.order("RM7", nodes=("safety_pilot#1",))
+    await asyncio.sleep(0.5)
+    assert system.incarnations["safety_pilot"] == 2
+    assert base.orders == [True, False]
+    supervisor.answer = "given up"
+    boss.order("RM7", decision=2, nodes=("safety_pilot#2",))
+    await asyncio.sleep(1.0)
+    assert base.engaged, "it stays so while the pilot does not come back, until released"
+    boss.release("RM7", decision=3)
+    await system.settle()
+    assert not base.engaged
+
+
+@in_system()
+async def test_the_brake_of_an_emergency_stop_is_not_released(system):
+    """Neither by the end of a respawn, nor by lives of the module that find themselves idle."""
+    boss, base, supervisor = await braking(system)
+    supervisor.delay_s = 0.5
+    boss.order("RM7", nodes=("safety_pilot#1",))
+    await system.settle()
+    boss.order("RM1")
+    await asyncio.sleep(1.5)
+    assert system.incarnations["safety_pilot"] == 2
+    boss.release("RM7")
+    await asyncio.sleep(0.5)
+    assert base.holders == {"RM1"}
+    for _ in range(3):
+        await system.kill("RM7")
+        system.start("RM7", RespawnBraked, nodes=["safety_pilot"])
+        for _ in range(20):
+            boss.release("RM7")  # as the manager does that finds it idle
+            await system.settle()
+            assert base.engaged
+            await asyncio.sleep(0.01)
+
+
+@in_system()
+async def test_the_farewells_of_an_emergency_stop_leave_the_brake_that_a_respawn_holds(system):
+    boss, base, supervisor = await braking(system)
+    supervisor.delay_s = 0.9
+    boss.order("RM1")
+    await asyncio.sleep(0.3)
+    boss.release("RM1")
+    await asyncio.sleep(0.1)
+    boss.order("RM7", nodes=("safety_pilot#1",))
+    await system.settle()
+    while system.incarnations["safety_pilot"] == 1:
+        assert base.engaged
+        await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+@in_system()
+async def test_the_pilot_is_bounded_until_released_and_one_that_keeps_no_bound_fails(system, obeys):
+    boss = Boss(system)
+    pilot = system.start("pilot", Pilot)
+    pilot.tells_bound = obeys
+    system.start("RM8", ReducedSpeed, top_speed_mps=0.6)
+    await asyncio.sleep(0.5)
+    boss.order("RM8")
+    await asyncio.sleep(3.0)
+    assert boss.phases == ["idle", "acting", "degraded" if obeys else "failed"]
+    assert pilot.gate.mode is PilotMode.AUTO
+    if obeys:
+        assert pilot.gate.top_speed_mps == 0.6
+        boss.release("RM8")
+        await system.settle()
+        assert pilot.gate.top_speed_mps == 0.0

@@ -9,6 +9,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.testing import VirtualSystem
 
@@ -63,33 +64,26 @@ class Base(Actor):
 
 
 class Pilot(Actor):
-    """A Safety Pilot: obeys orders, the strictest wins. `deaf`: it ignores them."""
+    """A Safety Pilot, of which only the orders are there; it may tell of no bound."""
 
     outputs = (topics.PILOT_STATUS,)
+    tells_bound = True
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.deaf = False
-        self.orders: dict[str, m.PilotOrder] = {}
+        self.gate = SafetyGate(GateLimits(), Checks(), 0.0)
         self.heard = 0
 
     @on(topics.PILOT_ORDER)
     def order(self, message: m.PilotOrder, header: Header) -> None:
         self.heard += 1
-        if self.deaf:
-            return
-        self.orders[header.source] = message
+        self.gate.order(header.source, message)
         self.status()
-
-    @property
-    def mode(self) -> m.PilotMode:
-        modes = {order.mode for order in self.orders.values() if order.engaged}
-        strictest_first = (m.PilotMode.STOP, m.PilotMode.TELEOPERATION)
-        return next((mode for mode in strictest_first if mode in modes), m.PilotMode.AUTO)
 
     @every(0.2)
     def status(self) -> None:
-        self.publish(topics.PILOT_STATUS, m.PilotStatus(self.mode, False, "", 0))
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(
+            self.gate.mode, False, "", 0, self.gate.top_speed_mps if self.tells_bound else 0.0))
 
 
 class Node(Actor):
@@ -105,12 +99,12 @@ class Supervisor(Actor):
         super().__init__(context)
         self.answer = "respawned"
         self.delay_s = 0.05
-        self.requests: list[tuple[float, fm.RespawnRequest]] = []
+        self.requests: list[fm.RespawnRequest] = []
         self.tasks: list[asyncio.Task[None]] = []
 
     @on(ftm_topics.RESPAWN)
     def respawn(self, message: fm.RespawnRequest, _header: Header) -> None:
-        self.requests.append((self.clock.now(), message))
+        self.requests.append(message)
         life = self.around.incarnations.get(message.node, 0)
         alive = message.node in self.around.tasks
         if self.answer == "nothing":
