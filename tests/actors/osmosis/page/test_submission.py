@@ -1,6 +1,5 @@
-"""When the HMI sends a mission (never again after it was accepted), and which orders it sends."""
+"""When the HMI sends missions and orders, and the effect of its joystick."""
 
-import msgspec
 import pytest
 
 from rampart.actors.operator.requests import RefusedError
@@ -20,6 +19,7 @@ from rampart.actors.osmosis.page.hmi import (
     RESPAWN_WINDOW_S,
     Orders,
     Submission,
+    effect,
     first_request,
 )
 
@@ -30,18 +30,6 @@ IDLE = MissionStatus("", "", MissionPhase.IDLE, 0, (), (), (), "")
 
 def status(request: MissionRequest, phase: MissionPhase = MissionPhase.RUNNING) -> MissionStatus:
     return MissionStatus(request.mission_id, request.name, phase, 0, GOALS, (), (), "")
-
-
-def test_the_first_mission_waits_until_the_mission_manager_shows_it():
-    submission = Submission("r7", 1, 0.0, FIRST)
-    assert submission.pending == FIRST
-    submission.hear(IDLE)
-    assert submission.pending == FIRST
-    submission.hear(status(FIRST))
-    assert submission.pending is None
-    submission.hear(IDLE)  # the Mission Manager has forgotten it
-    assert submission.pending is None
-    assert submission.expire(1000.0) == ""
 
 
 @pytest.mark.parametrize(("incarnation", "now_s", "sends"), [
@@ -66,16 +54,6 @@ def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
     assert first_request("r8", "AB", GOALS).mission_id != FIRST.mission_id
 
 
-@pytest.mark.parametrize("phase", [MissionPhase.RUNNING, MissionPhase.RETURNING])
-def test_a_mission_is_refused_while_another_one_is_under_way(phase):
-    submission = Submission("r7", 1, 0.0, FIRST)
-    with pytest.raises(RefusedError, match="waits"):
-        submission.ask("A", GOALS, 0.0)
-    submission.hear(status(FIRST, phase))
-    with pytest.raises(RefusedError, match=f"mission AB is {phase.value}"):
-        submission.ask("A", GOALS, 10.0)
-
-
 def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first_is_not():
     submission = Submission("r7", 2, 50.0, None)
     submission.ask("A", GOALS, 50.0)
@@ -88,44 +66,36 @@ def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first
     assert first.pending == FIRST
 
 
-UNDER_WAY = MissionStatus("r7/first", "AB", MissionPhase.RUNNING, 0, GOALS, (), (), "")
+UNDER_WAY = MissionStatus("r7/first", "AB", MissionPhase.RUNNING, 0, GOALS, (), (), "",
+                          orders=(MissionAction.PAUSE, MissionAction.HOME))
 
 
-def under_way(*possible: MissionAction) -> Orders:
+def test_an_order_is_repeated_as_the_same_message_until_it_is_answered_or_withdrawn():
     orders = Orders("r7/hmi.1", "operator")
-    orders.hear(msgspec.structs.replace(UNDER_WAY, orders=possible))
-    return orders
-
-
-def test_an_order_is_repeated_as_the_same_message_until_it_is_answered():
-    orders = under_way(MissionAction.PAUSE)
+    orders.hear(UNDER_WAY)
     order = orders.give(MissionAction.PAUSE, " runway \n in use ", 10.0)
     assert (order.action, order.reason, order.by) == (
         MissionAction.PAUSE, "runway in use", "operator")
-    assert orders.expire(10.1) == ""
+    with pytest.raises(RefusedError, match="pause waits for its answer"):
+        orders.give(MissionAction.HOME, "", 10.1)
     assert orders.answer(MissionOrderAnswer("another's", True, "")) == ""
-    assert orders.pending is order
+    assert (orders.pending, orders.expire(10.1)) == (order, "")
     assert orders.answer(MissionOrderAnswer(order.order, True, "")) == "pause obeyed"
     assert orders.pending is None
     assert orders.answer(MissionOrderAnswer(order.order, True, "")) == ""
-    orders.hear(msgspec.structs.replace(UNDER_WAY, orders=(MissionAction.HOME,)))
     other = orders.give(MissionAction.HOME, "", 11.0)
     assert other.order != order.order
     assert other.reason == NO_REASON
-    assert orders.answer(MissionOrderAnswer(other.order, False, "no way")) == "home refused: no way"
+    assert orders.expire(11.0 + ORDER_GIVE_UP_S) == (
+        "home was not obeyed: the Mission Manager does not answer")
 
 
-def test_an_order_that_makes_no_sense_in_the_present_phase_is_not_passed_on():
-    orders = Orders("r7/hmi.1", "operator")
-    with pytest.raises(RefusedError, match="no status of the Mission Manager was received yet"):
-        orders.give(MissionAction.PAUSE, "", 1.0)
-    orders = under_way(MissionAction.PAUSE, MissionAction.SKIP)
-    with pytest.raises(RefusedError, match="resume is not possible while the mission is running; "
-                                           "possible: pause, skip"):
-        orders.give(MissionAction.RESUME, "", 1.0)
-    orders.give(MissionAction.PAUSE, "", 1.0)
-    assert orders.expire(1.0 + ORDER_GIVE_UP_S) == (
-        "pause was not obeyed: the Mission Manager does not answer")
-    orders.give(MissionAction.PAUSE, "", 1.0)
-    with pytest.raises(RefusedError, match="pause waits for its answer"):
-        orders.give(MissionAction.SKIP, "", 1.1)
+@pytest.mark.parametrize(("known", "works", "text"), [
+    ({"mode": "teleoperation"}, True, "obeys only the joystick"),
+    ({"forbids": "RM2: it is stale", "mode": "stop"}, False, "no effect: RM2: it is stale"),
+    ({"dead_nodes": ("teleoperation",), "brake": True}, False, "teleoperation does not run")])
+def test_the_page_says_whether_the_stick_has_an_effect_and_why_not(known, works, text):
+    heard = {"pilot_heard": True, "mode": "auto", "forbids": "", "brake": False, "dead_nodes": ()}
+    got, words = effect(**heard | known)
+    assert got is works
+    assert text in words
