@@ -13,66 +13,56 @@ from rampart.actors.osmosis.control.localization.localization import Localizatio
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.actors.osmosis.control.localization_drive import field_airport
-from tests.osmosis_system import System, in_system, shipped_system
+from tests.osmosis_system import in_system, shipped_system
 
 FIELD = {"system": shipped_system(), "airport": field_airport()}
 
 
-class Drive:
-    """Drives in a circle, orders faults, and compares the pose with the truth."""
+@in_system(**FIELD)
+async def test_it_publishes_the_pose_20_times_a_second_and_says_which_source_is_excluded(system):
+    truth, poses = system.hear(topics.TRUTH), system.hear(topics.POSE)
+    told = system.hear(topics.LOCALIZATION_STATUS)
+    system.start("simulator", Simulator, seed=3)
+    system.start("localization", FusedLocalization, bridge_m=2.0)
 
-    def __init__(self, system: System, **parameters: float) -> None:
-        self.system = system
-        self.truth = system.hear(topics.TRUTH)
-        self.poses = system.hear(topics.POSE)
-        self._status = system.hear(topics.LOCALIZATION_STATUS)
-        system.start("simulator", Simulator, seed=3)
-        system.start("localization", FusedLocalization, **parameters)
-
-    @property
-    def status(self) -> m.LocalizationStatus:
-        return self._status[-1].message
-
-    async def drive(self, seconds: float) -> None:
+    async def drive(seconds: float) -> m.LocalizationStatus:
+        """Drive in a circle."""
         for _ in range(round(seconds / 0.05)):
-            self.system.say(topics.BASE_COMMAND, m.BaseCommand(0.8, 0.2))
+            system.say(topics.BASE_COMMAND, m.BaseCommand(0.8, 0.2))
             await asyncio.sleep(0.05)
+        return told[-1].message
 
-    def fail(self, name: str) -> None:
+    def fail(name: str) -> None:
         for order in OsmosisFaults().find(name, 0, topics.ALL).orders(name, math.inf):
-            self.system.say(bus_topics.INJECT, order)
+            system.say(bus_topics.INJECT, order)
 
-    def error_m(self) -> float:
+    def error_m() -> float:
         """Worst distance of a pose to the truth nearest in time, less the way in between."""
         worst_m = 0.0
-        for _, _, header, pose in self.poses:
-            true = min(self.truth, key=lambda t: abs(t.header.stamp - header.stamp))
+        for _, _, header, pose in poses:
+            true = min(truth, key=lambda t: abs(t.header.stamp - header.stamp))
             place = true.message.pose
             off_m = math.dist((pose.x_m, pose.y_m), (place.x_m, place.y_m))
             worst_m = max(worst_m, off_m - 0.8 * abs(true.header.stamp - header.stamp))
         return worst_m
 
-
-@in_system(**FIELD)
-async def test_it_publishes_the_pose_20_times_a_second_and_says_which_source_is_excluded(system):
-    driven = Drive(system, bridge_m=2.0)
-    await driven.drive(5.0)
-    stamps = [pose.header.stamp for pose in driven.poses]
+    status = await drive(5.0)
+    stamps = [pose.header.stamp for pose in poses]
     assert 95 <= len(stamps) <= 101
-    assert max(pose.time_s - pose.header.stamp for pose in driven.poses) < 0.05
+    assert max(pose.time_s - pose.header.stamp for pose in poses) < 0.05
     assert stamps == sorted(set(stamps))
-    assert driven.error_m() < 0.03
-    assert sorted(driven.status.in_use) == ["GPS", "IMU", "absolute pose", "odometry"]
-    assert (driven.status.excluded, driven.status.bridged_m) == ((), 0.0)
-    assert 0 < driven.status.position_sd_m < 0.03
-    assert 0 < driven.status.heading_sd_rad < 0.02
-    driven.fail("gps-bias")
-    await driven.drive(3.0)
-    assert driven.status.excluded == (("GPS", "moves differently from the others, 0.6 m"),)
-    assert driven.error_m() < 0.05
-    driven.fail("absolute-pose-dropout")
-    await driven.drive(5.0)  # 4 m: twice as far as it bridges
-    assert driven.truth[-1].header.stamp - driven.poses[-1].header.stamp > 1.0
+    assert error_m() < 0.03
+    assert sorted(status.in_use) == ["GPS", "IMU", "absolute pose", "odometry"]
+    assert (status.excluded, status.bridged_m) == ((), 0.0)
+    assert 0 < status.position_sd_m < 0.03
+    assert 0 < status.heading_sd_rad < 0.02
+    fail("gps-bias")
+    status = await drive(3.0)
+    assert status.excluded == (("GPS", "moves differently from the others, 0.6 m"),)
+    assert error_m() < 0.05
+    fail("absolute-pose-dropout")
+    await drive(5.0)  # 4 m: twice as far as it bridges
+    assert truth[-1].header.stamp - poses[-1].header.stamp > 1.0
 
 
 @in_system(**FIELD)
