@@ -27,11 +27,9 @@ GOOD, BAD = ((0.0, 0.0), (10.0, 0.0)), ((0.0, 0.0), (10.0, 5.0))
 
 # g a good route of the planner's first life, b a bad one, G and B of its second; n none.
 ROUTES = {
-    "good routes": ("g.g.g.g", "-------"),
     "one bad route is enough, and good ones must come for 500 ms": (
         "g.b.g.g.g.g.g", "--AAAAAAAA---"),
     "a planner that is wrong now and then": ("gbgggbggggggg", "-AAAAAAAAAA--"),
-    "silence cures nobody": ("gb..........", "-AAAAAAAAAAA"),
     "a planner that was respawned is believed": ("gb..GG", "-AAA--"),
     "unless it is wrong as well": ("gb..BBGGGGGGG", "-AAAAAAAAAA--"),
     "an inactive route is not bad": ("gbnnnnnnn", "-AAAAAA--"),
