@@ -19,10 +19,10 @@ from rampart.actors.osmosis.detection.pilot_output import (
     PilotOutput,
     PilotOutputMonitor,
 )
-from rampart.testing import Ear, run
+from rampart.testing import Ear
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.manager.bench import full_system
-from tests.osmosis_system import System
+from tests.osmosis_system import in_system
 
 PERIOD_S = 0.05
 HELD_S = 0.99
@@ -143,26 +143,23 @@ def test_a_module_claims_nothing_before_it_has_heard_a_fresh_output_or_waited():
 
 
 @pytest.mark.parametrize("silent_s", [0.5, 5.0])
-def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_silent(silent_s):
+@in_system(system=full_system())
+async def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_silent(
+        system, silent_s):
     """With the pilot itself, and the timeout of the shipped system."""
-
-    async def scenario():
-        async with System(system=full_system()) as system:
-            ear = system.start("ear", Ear)
-            system.start("safety_pilot", SafetyPilot)
-            system.start("DM12", PilotOutput)
-            await system.settle()
-            told = fm.ManagerStatus((), (), (), (), "safety-first", 0)
-            for i in range(round((3.0 + silent_s) * 20)):
-                system.say(ftm_topics.MANAGER_STATUS, told)
-                system.say(topics.SCAN, full_sweep(number=i))
-                if i < 40 or i >= 40 + silent_s * 20:
-                    system.say(topics.COMMAND, m.Twist(0.8, 0.1), "osmosis_control")
-                    system.say(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1), "standby_control")
-                await asyncio.sleep(PERIOD_S)
-            return ear.states
-
-    assert run(scenario) == ["idle"]
+    ear = system.start("ear", Ear)
+    system.start("safety_pilot", SafetyPilot)
+    system.start("DM12", PilotOutput)
+    await system.settle()
+    told = fm.ManagerStatus((), (), (), (), "safety-first", 0)
+    for i in range(round((3.0 + silent_s) * 20)):
+        system.say(ftm_topics.MANAGER_STATUS, told)
+        system.say(topics.SCAN, full_sweep(number=i))
+        if i < 40 or i >= 40 + silent_s * 20:
+            system.say(topics.COMMAND, m.Twist(0.8, 0.1), "osmosis_control")
+            system.say(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1), "standby_control")
+        await asyncio.sleep(PERIOD_S)
+    assert ear.states == ["idle"]
 
 
 shares = st.floats(0.0, 1.0)

@@ -20,9 +20,9 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
     intrusion,
 )
 from rampart.actors.osmosis.messages import GpsFix
-from rampart.testing import Ear, play, run, table
+from rampart.testing import Ear, play, table
 from tests.actors.osmosis.detection.lane import LANE
-from tests.osmosis_system import System, shipped_system
+from tests.osmosis_system import in_system, shipped_system
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05
@@ -122,26 +122,21 @@ def test_fence_timeline(events, expected):
     assert play(monitor, handle, events) == expected
 
 
-def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system():
-    async def scenario() -> None:
-        spec = shipped_system()
-        async with System(system=spec, airport=LANE) as system:
-            ear = system.start("ear", Ear)
-            detection = next(d for d in spec.detections if d.name == "DM1")
-            system.start("DM1", ProhibitedArea, **detection.parameters)
-            y_m = 0.0
-            for _ in range(20):  # along the lane, then straight at its edge with top speed
-                system.say(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
-                await asyncio.sleep(0.1)
-            assert ear.states == ["idle"]
-            while ear.states == ["idle"]:
-                y_m += 0.1
-                system.say(topics.GPS, m.GpsFix(20.0, y_m, 0.0, 1.0, 0.05))
-                await asyncio.sleep(0.1)
-            room_m = HALF_LANE_M - y_m - half_diagonal_m(spec.robot)
-            timing = spec.timing
-            brakes_m = 1.0 / (2 * spec.robot.braking_mps2)
-            assert room_m >= timing.arbitration_s + timing.actuation_s + brakes_m
-            assert room_m < 0.8
-
-    run(scenario)
+@in_system(system=shipped_system(), airport=LANE)
+async def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system(system):
+    spec, ear = shipped_system(), system.start("ear", Ear)
+    detection = next(d for d in spec.detections if d.name == "DM1")
+    system.start("DM1", ProhibitedArea, **detection.parameters)
+    y_m = 0.0
+    for _ in range(20):  # along the lane, then straight at its edge with top speed
+        system.say(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
+        await asyncio.sleep(0.1)
+    assert ear.states == ["idle"]
+    while ear.states == ["idle"]:
+        y_m += 0.1
+        system.say(topics.GPS, m.GpsFix(20.0, y_m, 0.0, 1.0, 0.05))
+        await asyncio.sleep(0.1)
+    room_m = HALF_LANE_M - y_m - half_diagonal_m(spec.robot)
+    brakes_m = 1.0 / (2 * spec.robot.braking_mps2)
+    assert room_m >= spec.timing.arbitration_s + spec.timing.actuation_s + brakes_m
+    assert room_m < 0.8

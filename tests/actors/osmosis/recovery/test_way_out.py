@@ -13,8 +13,8 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.messages import Way
 from rampart.actors.osmosis.recovery.emergency_stop import TOP_SPEED_MPS, Look, WayOut
-from rampart.testing import run
 from tests.actors.osmosis.driven_robot import driven
+from tests.virtual_time import within
 
 AIRPORT = load_airport("vallombre")
 STANDING = 0.02
@@ -51,77 +51,68 @@ async def inside():
         yield robot
 
 
-def test_the_operator_drives_the_robot_out_slowly_and_resets_the_emergency_stop():
-    async def scenario():
-        async with inside() as robot:
-            robot.hold(-1.0)
-            assert await robot.fastest(1.0) < STANDING, "not without the operator's word"
-            robot.let_go()
-            answers = await ask(robot)
-            assert answers[0].message.granted
-            await asyncio.sleep(0.5)
-            before_m = depth_m(robot)
-            robot.hold(1.0)
-            assert await robot.fastest(1.5) < STANDING, "the wrong direction"
-            assert depth_m(robot) == pytest.approx(before_m, abs=0.01)
-            robot.hold(-1.0)
-            speeds = [await robot.fastest(1.0)]
-            assert speeds[0] > 0.1
-            while answers[-1].message.granted:
-                speeds.append(await robot.fastest(0.5))
-            assert max(speeds) < TOP_SPEED_MPS + 0.03
-            assert answers[-1].message.is_out, answers[-1].message
-            await asyncio.sleep(0.5)
-            assert "RM1" in robot.manager.activated
-            assert depth_m(robot) < -0.5
-            assert await robot.fastest(1.0) < STANDING, "the stick is still held"
-            robot.let_go()
-            await robot.reset()
-
-    run(scenario)
+@within(inside)
+async def test_the_operator_drives_the_robot_out_slowly_and_resets_the_emergency_stop(robot):
+    robot.hold(-1.0)
+    assert await robot.fastest(1.0) < STANDING, "not without the operator's word"
+    robot.let_go()
+    answers = await ask(robot)
+    assert answers[0].message.granted
+    await asyncio.sleep(0.5)
+    before_m = depth_m(robot)
+    robot.hold(1.0)
+    assert await robot.fastest(1.5) < STANDING, "the wrong direction"
+    assert depth_m(robot) == pytest.approx(before_m, abs=0.01)
+    robot.hold(-1.0)
+    speeds = [await robot.fastest(1.0)]
+    assert speeds[0] > 0.1
+    while answers[-1].message.granted:
+        speeds.append(await robot.fastest(0.5))
+    assert max(speeds) < TOP_SPEED_MPS + 0.03
+    assert answers[-1].message.is_out, answers[-1].message
+    await asyncio.sleep(0.5)
+    assert "RM1" in robot.manager.activated
+    assert depth_m(robot) < -0.5
+    assert await robot.fastest(1.0) < STANDING, "the stick is still held"
+    robot.let_go()
+    await robot.reset()
 
 
 @pytest.mark.parametrize("lost", ["safety_pilot", "ftm_manager", "RM1", "gps"])
-def test_whatever_is_lost_meanwhile_stops_the_robot(lost):
-    async def scenario():
-        async with inside() as robot:
-            answers = await ask(robot)
-            await asyncio.sleep(0.5)
-            robot.hold(-1.0)
-            assert await robot.fastest(1.0) > 0.1
-            if lost == "gps":
-                robot.system.inject(topics.GPS, "drop", 100.0)
-            else:
-                await robot.system.kill(lost)
-            before_m = depth_m(robot)
-            await asyncio.sleep(1.3)
-            assert robot.speed_mps < STANDING
-            assert abs(depth_m(robot) - before_m) < 0.3
-            if lost in robot.system.layout.members:
-                robot.system.start_node(lost)
-                assert await robot.fastest(3.0) < STANDING, "nor when it is back"
-            robot.let_go()
-            if lost != "RM1":
-                await robot.until(lambda: not answers[-1].message.granted)
-            await robot.until(lambda: "RM1" in robot.manager.activated)
-
-    run(scenario)
+@within(inside)
+async def test_whatever_is_lost_meanwhile_stops_the_robot(robot, lost):
+    answers = await ask(robot)
+    await asyncio.sleep(0.5)
+    robot.hold(-1.0)
+    assert await robot.fastest(1.0) > 0.1
+    if lost == "gps":
+        robot.system.inject(topics.GPS, "drop", 100.0)
+    else:
+        await robot.system.kill(lost)
+    before_m = depth_m(robot)
+    await asyncio.sleep(1.3)
+    assert robot.speed_mps < STANDING
+    assert abs(depth_m(robot) - before_m) < 0.3
+    if lost in robot.system.layout.members:
+        robot.system.start_node(lost)
+        assert await robot.fastest(3.0) < STANDING, "nor when it is back"
+    robot.let_go()
+    if lost != "RM1":
+        await robot.until(lambda: not answers[-1].message.granted)
+    await robot.until(lambda: "RM1" in robot.manager.activated)
 
 
-def test_it_is_refused_while_the_robot_is_not_stopped_inside():
-    async def scenario():
-        async with driven() as robot:
-            answers = await ask(robot)
-            assert not answers[0].message.granted
-            assert "not in force" in answers[0].message.reason
-            robot.system.inject(topics.GPS, "drop", 1.5)
-            await robot.until(lambda: "RM1" in robot.manager.latched)
-            await asyncio.sleep(2.0)
-            answers = await ask(robot, "2")
-            assert not answers[-1].message.granted
-            assert "reset the emergency stop" in answers[-1].message.reason
-
-    run(scenario)
+@within(driven)
+async def test_it_is_refused_while_the_robot_is_not_stopped_inside(robot):
+    answers = await ask(robot)
+    assert not answers[0].message.granted
+    assert "not in force" in answers[0].message.reason
+    robot.system.inject(topics.GPS, "drop", 1.5)
+    await robot.until(lambda: "RM1" in robot.manager.latched)
+    await asyncio.sleep(2.0)
+    answers = await ask(robot, "2")
+    assert not answers[-1].message.granted
+    assert "reset the emergency stop" in answers[-1].message.reason
 
 
 def area_to_the_west(x_m, _y_m):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
 from itertools import groupby
 
 import pytest
@@ -13,10 +16,10 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode
-from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.driven_robot import Driven, driven
 from tests.osmosis_system import in_system, shipped_system
+from tests.virtual_time import within
 
 AIRPORT = load_airport("vallombre")
 START = AIRPORT.start
@@ -56,89 +59,84 @@ class Operator:
         await self.robot.until(lambda: self.status.phase is phase, within_s)
 
 
-def play(scenario, system: str) -> None:
-    """Run a scenario five seconds into a mission."""
-    async def scene() -> None:
-        async with driven(system) as robot:
-            operator = Operator(robot)
-            robot.system.say(topics.MISSION_REQUEST, m.MissionRequest("m1", "test", (DOWN, ROW)))
-            await asyncio.sleep(5.0)
-            await scenario(robot, operator)
-
-    run(scene)
-
-
-def test_the_robot_obeys_each_order():
-    async def scenario(robot, operator):
-        operator.ask(MissionAction.PAUSE, "aircraft passing")
-        await asyncio.sleep(1.5)
-        where = operator.place
-        await asyncio.sleep(2.0)
-        assert operator.place == pytest.approx(where, abs=0.01)
-        assert operator.status.phase is MissionPhase.PAUSED
-        assert operator.status.reason == "operator: aircraft passing"
-        operator.ask(MissionAction.PAUSE)
-        operator.ask(MissionAction.RESUME)
-        await robot.until(lambda: robot.speed_mps > 0.5)
-        assert [answer.message.accepted for answer in operator.answers] == [True, False, True]
-        operator.ask(MissionAction.REPLAN)
-        await asyncio.sleep(0.5)
-        assert operator.routes[-1].message.plan == operator.answers[-1].message.plan == 1
-        assert robot.speed_mps > 0.3, "without a stop"
-        operator.ask(MissionAction.SKIP, "closed")
-        await asyncio.sleep(1.0)
-        assert (operator.status.step, operator.status.skipped) == (1, (0,))
-        operator.ask(MissionAction.CANCEL, "enough")
-        await asyncio.sleep(1.5)
-        assert robot.speed_mps < STANDING
-        assert operator.status.phase is MissionPhase.CANCELLED
-
-    play(scenario, "paper")
-
-
-def test_home():
-    """The turn on the spot, in which the wheels slip, is held against no position (DM1)."""
-
-    async def scenario(robot, operator):
-        await asyncio.sleep(6.0)
-        operator.ask(MissionAction.HOME, "rain")
-        await operator.until(MissionPhase.CANCELLED, 60)
-        assert operator.phases == ["running", "returning home", "cancelled"]
-        assert operator.status.reason == "returned home, operator: rain"
-        assert math.dist(operator.place, (START.x_m, START.y_m)) < 1.1
-        await asyncio.sleep(1.0)
-        assert robot.speed_mps < STANDING
-
-    play(scenario, "osmosis")
-
-
-def test_the_operator_drives_elsewhere_and_hands_back_and_the_mission_goes_on_from_there():
-    async def scenario(robot, operator):
-        robot.system.inject(topics.POSE, "drop", 12.0)
+@asynccontextmanager
+async def under_way(system: str = "osmosis") -> AsyncIterator[Operator]:
+    """A shipped system five seconds into a mission, and its operator."""
+    async with driven(system) as robot:
+        operator = Operator(robot)
+        robot.system.say(topics.MISSION_REQUEST, m.MissionRequest("m1", "test", (DOWN, ROW)))
         await asyncio.sleep(5.0)
-        assert robot.speed_mps < STANDING
-        assert operator.status.reason.startswith("held by RM5: DM6: localization not updated")
-        operator.ask(MissionAction.RESUME)
-        await asyncio.sleep(0.2)
-        assert "continues when the robot is released" in operator.answers[-1].message.reason
-        where = operator.place
-        robot.hold(0.0, 1.0)
-        await asyncio.sleep(1.5)
-        robot.hold(0.8)
-        await asyncio.sleep(4.0)
-        assert math.dist(where, operator.place) > 1.0
-        assert operator.status.phase is MissionPhase.PAUSED
-        robot.let_go()
-        routes = len(operator.routes)
-        await operator.until(MissionPhase.RUNNING, 10)
-        await asyncio.sleep(1.0)
-        anew = operator.routes[routes:][-1].message
-        assert anew.active
-        assert math.dist(anew.waypoints[0], operator.place) < 2.5, "planned from where it is now"
-        await robot.until(lambda: robot.speed_mps > 0.5)
-        assert operator.phases == ["running", "paused", "running"]
+        yield operator
 
-    play(scenario, "osmosis")
+
+@within(partial(under_way, "paper"))
+async def test_the_robot_obeys_each_order(operator):
+    robot = operator.robot
+    operator.ask(MissionAction.PAUSE, "aircraft passing")
+    await asyncio.sleep(1.5)
+    where = operator.place
+    await asyncio.sleep(2.0)
+    assert operator.place == pytest.approx(where, abs=0.01)
+    assert operator.status.phase is MissionPhase.PAUSED
+    assert operator.status.reason == "operator: aircraft passing"
+    operator.ask(MissionAction.PAUSE)
+    operator.ask(MissionAction.RESUME)
+    await robot.until(lambda: robot.speed_mps > 0.5)
+    assert [answer.message.accepted for answer in operator.answers] == [True, False, True]
+    operator.ask(MissionAction.REPLAN)
+    await asyncio.sleep(0.5)
+    assert operator.routes[-1].message.plan == operator.answers[-1].message.plan == 1
+    assert robot.speed_mps > 0.3, "without a stop"
+    operator.ask(MissionAction.SKIP, "closed")
+    await asyncio.sleep(1.0)
+    assert (operator.status.step, operator.status.skipped) == (1, (0,))
+    operator.ask(MissionAction.CANCEL, "enough")
+    await asyncio.sleep(1.5)
+    assert robot.speed_mps < STANDING
+    assert operator.status.phase is MissionPhase.CANCELLED
+
+
+@within(under_way)
+async def test_home(operator):
+    """The turn on the spot, in which the wheels slip, is held against no position (DM1)."""
+    robot = operator.robot
+    await asyncio.sleep(6.0)
+    operator.ask(MissionAction.HOME, "rain")
+    await operator.until(MissionPhase.CANCELLED, 60)
+    assert operator.phases == ["running", "returning home", "cancelled"]
+    assert operator.status.reason == "returned home, operator: rain"
+    assert math.dist(operator.place, (START.x_m, START.y_m)) < 1.1
+    await asyncio.sleep(1.0)
+    assert robot.speed_mps < STANDING
+
+
+@within(under_way)
+async def test_the_operator_drives_elsewhere_and_hands_back_and_the_mission_goes_on_from_there(
+        operator):
+    robot = operator.robot
+    robot.system.inject(topics.POSE, "drop", 12.0)
+    await asyncio.sleep(5.0)
+    assert robot.speed_mps < STANDING
+    assert operator.status.reason.startswith("held by RM5: DM6: localization not updated")
+    operator.ask(MissionAction.RESUME)
+    await asyncio.sleep(0.2)
+    assert "continues when the robot is released" in operator.answers[-1].message.reason
+    where = operator.place
+    robot.hold(0.0, 1.0)
+    await asyncio.sleep(1.5)
+    robot.hold(0.8)
+    await asyncio.sleep(4.0)
+    assert math.dist(where, operator.place) > 1.0
+    assert operator.status.phase is MissionPhase.PAUSED
+    robot.let_go()
+    routes = len(operator.routes)
+    await operator.until(MissionPhase.RUNNING, 10)
+    await asyncio.sleep(1.0)
+    anew = operator.routes[routes:][-1].message
+    assert anew.active
+    assert math.dist(anew.waypoints[0], operator.place) < 2.5, "planned from where it is now"
+    await robot.until(lambda: robot.speed_mps > 0.5)
+    assert operator.phases == ["running", "paused", "running"]
 
 
 async def stand(system, first: int, last: int) -> None:
