@@ -17,10 +17,8 @@ from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli import new, service_verb
 from rampart.cli.analyse import (
     check_verbs,
-    cut_set_verbs,
     decide_verbs,
-    tree_verb,
-    verify_verb,
+    tree_verbs,
 )
 from rampart.cli.look import doctor_verb, ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
@@ -28,7 +26,6 @@ from rampart.cli.operate import (
     inject_verb,
     keys_verb,
     node_verbs,
-    operator_verbs,
     token_verbs,
 )
 from rampart.cli.output import NoEffectError, say_text, warn
@@ -37,9 +34,9 @@ from rampart.cli.verbs import FORMATTER, PORT
 from rampart.files import loading, streams, working_folder
 
 _MODULES = (
-    node_verbs, topic_verbs, ros_verbs, inject_verb, operator_verbs, serving_verbs, adapt_verb,
-    record_verbs, incident_verbs, keys_verb, token_verbs, check_verbs, cut_set_verbs,
-    decide_verbs, tree_verb, verify_verb, doctor_verb, service_verb)
+    node_verbs, topic_verbs, ros_verbs, inject_verb, serving_verbs, adapt_verb,
+    record_verbs, incident_verbs, keys_verb, token_verbs, check_verbs, tree_verbs,
+    decide_verbs, doctor_verb, service_verb)
 """Each adds its verbs."""
 
 _GROUPS = {

@@ -1,4 +1,4 @@
-"""The messages of a run: the newest of each topic, counts and rates. Pure.
+"""The messages of a run: the newest of each topic, counts and rates.
 
 `rampart top` and `rampart live metrics` use it.
 """
@@ -13,8 +13,14 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.operator.processes import ProcessObserver
+from rampart.actors.system.topics import declared_topics, own_topics
+from rampart.cli import systems
+from rampart.cli.output import warn
 from rampart.cli.robot_lines import SILENT, RobotLines
+from rampart.cli.session import Session
 
 DECODED: tuple[Topic[Any], ...] = (
     ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
@@ -23,6 +29,9 @@ DECODED: tuple[Topic[Any], ...] = (
 
 STALE_S = 2.0
 """Simulated seconds without a message after which a state is silent."""
+
+_USAGE_EVERY = 4
+"""Samples for each look at /proc, whose clock ticks 100 times per second."""
 
 _KEPT = 50
 _SAMPLES = 13
@@ -125,3 +134,57 @@ def manager_in_words(status: m.ManagerStatus | None) -> str:
     if len(parts) == 1:
         parts.append("nothing active")
     return "; ".join(parts)
+
+
+def draw(session: Session, picture: RunPicture) -> None:
+    """Keep all messages of a session in a picture, with the lines of its robot."""
+    clock = session.clock
+
+    def subscribe(topic: Topic[Any]) -> None:
+        if topic in (*DECODED, *picture.lines.read):
+            session.listen(topic, lambda _key, header, body: picture.heard(
+                topic, header, body, clock.now()))
+        else:
+            session.overhear(topic, lambda _key, _load: picture.count(topic))
+
+    known: tuple[Topic[Any], ...] = topics.ALL
+    try:
+        spec = systems.load(session.run.system_file)
+        picture.lines = systems.lines_of(spec)
+        known = declared_topics(spec)
+        known += own_topics(spec)
+    except ValueError as error:  # for example a run from another folder
+        warn(f"{error}; only topics of the engine are counted")
+    for topic in known:
+        subscribe(topic)
+
+
+class Watch:
+    """Messages and processor use of one run.
+
+    Attributes:
+        session: the connection to the run.
+        picture: the messages.
+        used: last result of `ProcessObserver.look`; empty for a replay, whose process numbers may
+            belong to other processes today.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.picture = RunPicture()
+        self.used: dict[str, Any] = {"nodes": {}, "guards": ()}
+        self._processes = ProcessObserver(
+            session.run.base_port, session.run.pid, session.run.host)
+        self._looks = 0
+        draw(session, self.picture)
+
+    def look(self) -> float:
+        """Take a sample, look at the processes if due, and return the simulated time."""
+        now_s = self.session.clock.now()
+        self.picture.sample(now_s)
+        table = self.picture.latest(topics.NODES)
+        if table is not None and not self.session.run.replay_of:
+            if self._looks % _USAGE_EVERY == 0:
+                self.used = self._processes.look(table)
+            self._looks += 1
+        return now_s

@@ -10,8 +10,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import uuid
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -24,12 +25,13 @@ from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
+from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run, find_runs
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, key_file
 from rampart.actors.runtime.clock import Clock
-from rampart.cli.output import NoEffectError, UsageError, refusing
+from rampart.actors.supervision.process_title import process_state
+from rampart.cli.output import NoEffectError, UsageError, refusing, warn
 
 T = TypeVar("T")
 
@@ -291,3 +293,64 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
         yield Session(run, bus, Clock(run.origin_s, run.rate), may_order=kind != VIEWER)
     finally:
         await bus.close()
+
+
+LOOK_S = 0.25
+"""Real seconds between two checks whether a run has ended or begun."""
+
+_AGAIN_S = 5.0
+
+
+def is_over(run: RunInfo) -> bool:
+    """Whether the launcher of a run has ended; its nodes end with it."""
+    return process_state(run.pid) in {"X", "Z"}
+
+
+async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
+    """Wait for a run to join; return False if `stop` comes first."""
+    while not stop.is_set():
+        runs = await asyncio.to_thread(find_runs)
+        if any(port in {None, run.base_port} for run in runs):
+            return True
+        await pause(stop, LOOK_S)
+    return False
+
+
+async def sessions(port: int | None, stop: asyncio.Event) -> AsyncGenerator[Session, None]:
+    """Wait for a run and yield its session, and that of each later run.
+
+    The body of the caller's loop ends when `is_over` or `stop` is true.
+
+    Args:
+        port: base port of the run, by `--run`; None for the only one.
+        stop: ends the iteration.
+
+    Raises:
+        UsageError: there are several runs, and no port.
+    """
+    while await wait_for_run(port, stop):
+        try:
+            async with connect(port) as session:
+                yield session
+        except UsageError as error:
+            if len(find_runs()) > 1:
+                raise UsageError(str(error).replace("--port", "--run")) from None
+        except NoEffectError as error:
+            warn(str(error))
+            await pause(stop, _AGAIN_S)
+
+
+@contextlib.contextmanager
+def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
+    """Set an event on SIGINT, SIGTERM and SIGHUP."""
+    loop = asyncio.get_running_loop()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)

@@ -17,7 +17,7 @@ import math
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -163,11 +163,13 @@ class BagWriter:
         time_zero_s: simulated time at `log_time` 0.
         begin_s: simulated time at which the recording begins; that of `time_zero_s` if None.
         views: translation for viewers; None writes none.
+        wants: returns whether a full key is recorded.
         from_start: whether it begins with the first message of every node.
     """
 
     def __init__(self, file: BinaryIO, documents: Documents, *, time_zero_s: float = 0.0,
                  begin_s: float | None = None, views: Views | None = None,
+                 wants: Callable[[str], bool] = lambda _key: True,
                  from_start: bool = False) -> None:
         self.messages = 0
         self.garbage = 0
@@ -180,8 +182,9 @@ class BagWriter:
         with contextlib.suppress(ValueError):  # an actor whose module is missing
             self._own = own_topics(documents.known.system)
         self._views = views
+        self._wants = wants
         self._schemas: dict[Any, int] = {}
-        self._channels: dict[str, int] = {}
+        self._channels: dict[str, int | None] = {}
         self._view_channels: dict[str, int] = {}
         from mcap.writer import CompressionType, Writer  # noqa: PLC0415 few runs are recorded
 
@@ -211,8 +214,10 @@ class BagWriter:
         if header is not None:
             self.gaps.add(header)
         if key not in self._channels:
-            self._channels[key] = self._channel(key, form.topic)
+            self._channels[key] = self._channel(key, form.topic) if self._wants(key) else None
         number = self._channels[key]
+        if number is None:
+            return
         log_ns = stamp_ns = self._ns(at_s)
         if header is None:
             self.garbage += not form.is_foreign

@@ -50,6 +50,7 @@ class Recorder(RunListener):
         port: base port of the run.
         path: path of the file.
         overwrite: whether the file may exist.
+        wants: returns whether a full key is recorded.
         launcher: as in `RunListener`.
         credentials: returns the recorder's credentials on the bus of a run, for other hosts.
 
@@ -61,11 +62,13 @@ class Recorder(RunListener):
     which: ClassVar[str] = RECORDERS[0]
 
     def __init__(self, port: int, path: Path, *, overwrite: bool = False,
+                 wants: Callable[[str], bool] = lambda _key: True,
                  launcher: int | None = None,
                  credentials: Callable[[RunInfo], Credentials | None] = lambda _run: None
                  ) -> None:
         super().__init__(port, path, launcher)
         self._overwrite = overwrite
+        self._wants = wants
         self._from_start = launcher is not None
         self._credentials = credentials
         self._other_hosts: _OtherHosts | None = None
@@ -85,7 +88,7 @@ class Recorder(RunListener):
         self.file = BagWriter(
             open_target(self.path, overwrite=self._overwrite), documents, begin_s=begin_s,
             time_zero_s=min(0.0, float(math.floor(begin_s))),
-            views=documents.known.views(), from_start=self._from_start)
+            views=documents.known.views(), wants=self._wants, from_start=self._from_start)
         if info.hosts:
             self._other_hosts = _OtherHosts(info.endpoints, self._credentials(info), begun_s)
         return self

@@ -24,9 +24,8 @@ from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.message_form import plain_schema
 from rampart.actors.recording.run_documents import known_of
 from rampart.actors.recording.views import encode
-from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals
 from rampart.cli.output import UsageError, between, say, warn
-from rampart.cli.session import Session, pause
+from rampart.cli.session import LOOK_S, Session, is_over, pause, sessions, stopped_by_signals
 
 
 class FoxgloveViewer(ServerListener):

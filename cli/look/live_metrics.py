@@ -26,10 +26,9 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.process_usage import ProcessCount, read_count
 from rampart.actors.web.listening import listen
 from rampart.actors.web.server import WebServer
-from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.output import between, say
-from rampart.cli.run_picture import RunPicture
-from rampart.cli.session import days_left, pause
+from rampart.cli.run_picture import RunPicture, Watch
+from rampart.cli.session import LOOK_S, days_left, is_over, pause, sessions, stopped_by_signals
 
 Row = tuple[tuple[str, ...], float]
 """Values of the labels, and the value."""

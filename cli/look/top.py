@@ -19,11 +19,10 @@ from rich.text import Text
 from rampart.actors.bus import run_info
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.cli.following import LOOK_S, Watch, is_over, stopped_by_signals
 from rampart.cli.output import print_json, say
 from rampart.cli.robot_lines import Row
-from rampart.cli.run_picture import RunPicture, manager_in_words
-from rampart.cli.session import connect, pause
+from rampart.cli.run_picture import RunPicture, Watch, manager_in_words
+from rampart.cli.session import LOOK_S, connect, is_over, pause, stopped_by_signals
 from rampart.cli.terminal import END, keys
 from rampart.files.plain_text import printable
 from rampart.manager.strategies.registry import decision_in_words

@@ -18,8 +18,8 @@ from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
-from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
-from rampart.cli.operate.operator_verbs import trigger
+from rampart.cli.look.topic_verbs import check_member, resolve, topics_for
+from rampart.cli.operate.node_verbs import trigger
 from rampart.cli.output import (
     NoEffectError,
     UsageError,

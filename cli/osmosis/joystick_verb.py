@@ -16,11 +16,10 @@ from rampart.actors.detection.finding import Lasting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import Joystick
-from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.lines import pilot_in_words
 from rampart.cli.osmosis.mission_verb import checked_reason
 from rampart.cli.output import NoEffectError, UsageError, between, say
-from rampart.cli.session import Latest, Session, connect, pause
+from rampart.cli.session import Latest, Session, connect, is_over, pause, stopped_by_signals
 from rampart.cli.terminal import END, keys
 from rampart.cli.verbs import PORT, add_verb, number, option
 from rampart.files.plain_text import printable

@@ -37,7 +37,7 @@ from rampart.actors.recording.incidents import Incident, incidents_in, state_fol
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.run_documents import recorded_system
 from rampart.cli.output import UsageError, print_json, print_rows, print_table, say
-from rampart.cli.record.record_verbs import PLAYING, replay
+from rampart.cli.record.replaying import PLAYING, replay
 from rampart.cli.verbs import JSON, add_family, add_verb, flag, option
 from rampart.files.plain_text import one_line
 

@@ -12,38 +12,31 @@ Examples:
 from __future__ import annotations
 
 import argparse
-import asyncio
-import contextlib
-import fnmatch
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.run_info import find_run
-from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.run_info import RunInfo, find_run
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import result_of, stop_pipe
 from rampart.actors.recording.recorder import Recorder
-from rampart.cli.following import stopped_by_signals
+from rampart.actors.system.topics import system_topics
+from rampart.cli import systems
 from rampart.cli.output import (
     NoEffectError,
-    UsageError,
-    between,
     positive,
     print_json,
     print_table,
-    progress,
     say,
 )
 from rampart.cli.record.export import Export
-from rampart.cli.record.film import FRAMES_HZ, Stage, Viewer, film
-from rampart.cli.record.replaying import DEFAULT_PORT, RecordedRun, Replay
+from rampart.cli.record.replaying import PLAYING, TOPICS, matcher, replay
 from rampart.cli.session import tools_credentials
 from rampart.cli.verbs import (
     JSON,
@@ -53,25 +46,8 @@ from rampart.cli.verbs import (
     flag,
     number,
     option,
-    whole,
-    word,
 )
 from rampart.files.plain_text import one_line
-
-_PORTS = (1024, 65535)
-
-_TOPICS: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
-
-PLAYING = (
-    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
-    option("--topics", **_TOPICS, help="play only keys that match a pattern"),
-    number("--start", "S", "start at simulated second S of the run"),
-    whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
-    flag("--viewer", "show the robot in MuJoCo's viewer"),
-    word("--video", "FILE.mp4", "write a video of the robot in MuJoCo instead of playing; "
-         "needs the extra `video`"),
-    whole("--port", "N", f"base port of the replay (default: {DEFAULT_PORT})", DEFAULT_PORT))
-"""Options of a replay."""
 
 
 def add(verbs: Any) -> None:
@@ -79,6 +55,7 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "record", "record the run", record, PORT,
              option("file", metavar="FILE", nargs="?",
                     help="MCAP file (default: rampart-TIME.mcap)"),
+             option("--topics", **TOPICS, help="record only keys that match a pattern"),
              number("--duration", "S", "end after S real seconds"),
              flag("--overwrite", "replace FILE if it exists"))
     add_verb(verbs, "replay", "play back a recording", replay,
@@ -97,7 +74,7 @@ def add(verbs: Any) -> None:
                     help="new folder (default: IN without its suffix)"),
              option("--to", choices=("csv", "parquet"), default="csv",
                     help="format (default: csv)"),
-             option("--topics", **_TOPICS, help="write only channels that match a pattern"), JSON)
+             option("--topics", **TOPICS, help="write only channels that match a pattern"), JSON)
 
 
 def record(options: argparse.Namespace) -> int:
@@ -110,13 +87,15 @@ def record(options: argparse.Namespace) -> int:
     Examples:
       rampart record
       rampart record crash.mcap --duration 60
+      rampart record poses.mcap --topics 'localization/*' 'detection/*'
     """
     positive("--duration", options.duration, below=1e9)
     run = find_run(options.port)
+    wants = matcher(options.topics, _keys(run) if options.topics else ())
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     check_target(path, overwrite=options.overwrite)
     credentials = tools_credentials(run)[0] if run.hosts else None
-    recorder = Recorder(run.base_port, path, overwrite=options.overwrite,
+    recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
                         credentials=lambda _run: credentials)
     recorder.open()
     stop = stop_pipe()
@@ -131,97 +110,10 @@ def record(options: argparse.Namespace) -> int:
     return 0
 
 
-async def replay(options: argparse.Namespace) -> int:
-    """Play a recording back.
-
-    Play back a recording on a separate bus. Tools such as `rampart topic echo` and
-    `rampart status` find it like a run; use --port if a robot runs, too. Orders
-    are refused, and no message of the recording reaches a robot.
-    A robot with a model in MuJoCo is shown in its viewer, or filmed without a bus:
-    --rate is the simulated seconds per second of the video.
-
-    Examples:
-      rampart replay run.mcap --hmi-port 8090
-      rampart replay run.mcap --viewer
-      rampart replay run.mcap --video run.mp4 --rate 4
-      rampart replay run.mcap --rate 4 --start 60 --topics 'manager/*'
-    """
-    _check(options)
-    stop = asyncio.Event()
-    with stopped_by_signals(stop):
-        path = Path(options.file)
-        known = Summary(BagReader(path)).keys if options.topics else ()
-        chosen: dict[str, Any] = {"start_s": options.start,
-                                  "wants": matcher(options.topics, known)}
-        if options.video:
-            return await _film(RecordedRun(path, **chosen), options, stop)
-        player = Replay(path, port=options.port, rate=options.rate, hmi_port=options.hmi_port,
-                        report=say, **chosen)
-        if player.summary.reader.damage:
-            say(f"{options.file}: damaged ({player.summary.reader.damage}); playing the rest")
-        with contextlib.ExitStack() as stack:
-            if options.viewer:
-                viewer = stack.enter_context(contextlib.closing(Viewer(Stage(player))))
-                player.viewer = viewer.take
-            page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
-            say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
-                "ctrl-C ends it")
-            await player.run(stop)
-    refused = f", {player.refused} of another version left out" if player.refused else ""
-    say(f"played {player.played} messages{refused}")
-    if not player.played:
-        raise NoEffectError("no message was played")
-    return 0
-
-
-async def _film(run: RecordedRun, options: argparse.Namespace, stop: asyncio.Event) -> int:
-    """Write a video of a recording, and return the exit code."""
-    frames = 0
-    with progress() as show, contextlib.closing(
-            film(run, Path(options.video), options.rate)) as written:
-        for at_s in written:
-            frames += 1
-            show(f"{options.video}: {at_s:.1f} s of simulated time")
-            await asyncio.sleep(0)
-            if stop.is_set():
-                raise NoEffectError(f"{options.video}: interrupted, not written")
-    say(f"{options.video}: {frames} frames, {frames / FRAMES_HZ:.1f} s")
-    return 0
-
-
-def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
-    """Return a filter of full keys for the patterns of --topics; without patterns all pass.
-
-    Raises:
-        UsageError: a pattern matches no known key.
-    """
-    keys = [key.removeprefix(f"{ROOT}/") for key in known]
-    patterns = [g.removeprefix("/").removeprefix(f"{ROOT}/") for g in globs]
-    for pattern in patterns:
-        if not any(fnmatch.fnmatchcase(key, pattern) for key in keys):
-            families = sorted({key.split("/")[0] for key in keys})
-            raise UsageError(f"--topics {pattern}: matches no topic; known: "
-                             f"{', '.join(f'{name}/…' for name in families)} "
-                             "(`rampart topic list`, `rampart bag info`)")
-    if not patterns:
-        return lambda _key: True
-    return lambda key: any(
-        fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
-
-
-
-
-def _check(options: argparse.Namespace) -> None:
-    between("--rate", options.rate, 0.01, 1000)
-    if options.start is not None and not -1e9 < options.start < 1e9:
-        raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
-    if options.video and (options.viewer or options.hmi_port):
-        raise UsageError(f"--video {options.video}: plays nothing; not with --viewer or --hmi-port")
-    between("--port", options.port, *_PORTS)
-    between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
-    if options.hmi_port == options.port:
-        raise UsageError(f"--hmi-port {options.hmi_port}: is the replay's own --port; choose "
-                         "another --hmi-port")
+def _keys(run: RunInfo) -> list[str]:
+    """Return all full keys of a run's system."""
+    return [key for topic in system_topics(systems.load(run.system_file))
+            for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
 
 
 def bag_info(options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from rampart.actors.bus.run_info import RunInfo
-from rampart.cli import following
+from rampart.cli import session
 from rampart.cli.output import UsageError
 
 RUN = RunInfo(os.getpid(), 7450, 1.0, 0.0, "paper.toml", "", (), "first", 0, "AB")
@@ -33,9 +33,9 @@ def runs(monkeypatch) -> list[RunInfo]:
             raise UsageError("no run found" if not found else "several runs, choose with --port")
         yield found[0]
 
-    monkeypatch.setattr(following, "find_runs", lambda: list(there))
-    monkeypatch.setattr(following, "connect", connect)
-    monkeypatch.setattr(following, "LOOK_S", 0.001)
+    monkeypatch.setattr(session, "find_runs", lambda: list(there))
+    monkeypatch.setattr(session, "connect", connect)
+    monkeypatch.setattr(session, "LOOK_S", 0.001)
     return there
 
 
@@ -43,8 +43,8 @@ async def test_a_run_is_waited_for_and_the_next_one_follows_until_the_user_has_h
     stop, names = asyncio.Event(), []
 
     async def follow() -> None:
-        async for session in following.sessions(8000, stop):
-            names.append(session.run_id)
+        async for joined in session.sessions(8000, stop):
+            names.append(joined.run_id)
             runs[:] = [run("other", 9000)]
 
     following_runs = asyncio.create_task(follow())
@@ -63,7 +63,7 @@ async def test_a_run_is_waited_for_and_the_next_one_follows_until_the_user_has_h
 async def test_several_runs_are_a_choice_for_the_user_by_the_verbs_own_option(runs):
     runs += [run("one", 8000), run("other", 9000)]
     with pytest.raises(UsageError, match="choose with --run"):
-        async for _ in following.sessions(None, asyncio.Event()):
+        async for _ in session.sessions(None, asyncio.Event()):
             pass
 
 
@@ -72,7 +72,7 @@ async def test_a_closed_terminal_ends_it_but_under_nohup(nohup):
     stop = asyncio.Event()
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
     try:
-        with following.stopped_by_signals(stop):
+        with session.stopped_by_signals(stop):
             os.kill(os.getpid(), signal.SIGHUP)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), 0.1 if nohup else 10)
@@ -82,5 +82,5 @@ async def test_a_closed_terminal_ends_it_but_under_nohup(nohup):
 
 
 def test_a_run_is_over_when_its_launcher_is():
-    assert not following.is_over(RUN)
-    assert following.is_over(msgspec.structs.replace(RUN, pid=2**22 + 1))
+    assert not session.is_over(RUN)
+    assert session.is_over(msgspec.structs.replace(RUN, pid=2**22 + 1))

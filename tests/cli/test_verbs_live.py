@@ -25,9 +25,8 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.fault_watch import Order
 from rampart.cli import systems
-from rampart.cli.following import draw
 from rampart.cli.main import main
-from rampart.cli.run_picture import RunPicture
+from rampart.cli.run_picture import RunPicture, draw
 from rampart.cli.session import connect
 from tests.porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
 
@@ -237,19 +236,27 @@ async def test_a_silent_topic_is_said_to_be_silent(run):
     assert err == "rampart: no message on plan/route within 0.2 s\n"
 
 
-async def test_echo_ends_with_the_run(run, monkeypatch):
+@pytest.mark.parametrize("verb", ["echo", "hz"])
+async def test_echo_and_hz_end_with_the_run(run, monkeypatch, verb):
     looks = iter([False, False])
     monkeypatch.setattr("rampart.cli.look.topic_verbs.is_over", lambda _run: next(looks, True))
-    code, out, err = await run.call("topic", "echo", "localization/pose")
+    code, out, err = await run.call("topic", verb, "localization/pose")
     assert code == 0
     assert "localization/pose" in out
     assert err == "rampart: the run has ended: test run (port 7450)\n"
 
 
+async def test_hz_measures_in_simulated_time(run):
+    out = await run.out("topic", "hz", "localization/pose", "--duration", "1.5")
+    name, rate_hz, unit = out.splitlines()[-1].split()
+    assert (name, unit) == ("localization/pose:", "Hz")
+    assert 5 < float(rate_hz) < 15
+
+
 async def test_topics_of_the_robot_s_own_are_heard_counted_and_disturbed(
         run, capsys, monkeypatch, tmp_path):
     own = msgspec.structs.replace(run.info, system_file=str(write_porter_system(tmp_path)))
-    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: own)
+    monkeypatch.setattr("rampart.cli.look.topic_verbs.find_run", lambda _port: own)
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: own)
     code, out, _ = await run.call("topic", "echo", "porter/axle/*", "-n", "4")
     assert (code, {line.split(" ", 1)[1] for line in out.splitlines()}) == (

@@ -14,8 +14,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
-from rampart.cli.look.topic_catalogue import resolve
-from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.look.topic_verbs import in_line, resolve
 from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verb import choose
 from rampart.cli.output import UsageError
@@ -82,7 +81,7 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
     (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped system: os"]),
     (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
-    (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),
+    (["inject", "laser-drift"], ["'laser-drift'", "did you mean laser-dropout?"]),
     (["inject", "drop:no/such"], ["no run found"]),
     (["inject", "melt:plan/route"], ["'melt:plan/route'", "drop, freeze"]),
     (["inject", "corrupt:summit_xl/brake"], ["no number", "BrakeCommand"]),
@@ -188,7 +187,7 @@ def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topic
     file = write_porter_system(tmp_path)
     file.write_text(file.read_text().replace("tests.porter_actors:", "no_actors:"))
     run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
-    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: run)
+    monkeypatch.setattr("rampart.cli.look.topic_verbs.find_run", lambda _port: run)
     for arguments in (["topic", "list", "--system", file], ["inject", "drop:porter/load"],
                       ["campaign", "--fault", "drop:porter/load", "--system", file]):
         assert "No module named 'no_actors'" in refused(*arguments)

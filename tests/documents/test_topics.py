@@ -11,7 +11,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import own_topics, system_topics
 from rampart.cli import systems
-from rampart.cli.look.topic_catalogue import markdown, uses
+from rampart.cli.look.topic_verbs import markdown, uses
 from tests import ROOT, porter_actors, system_file
 from tests.porter_actors import AXLE, LOAD, write_porter_system
 

@@ -12,8 +12,7 @@ import pytest
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.cli.main import main
-from rampart.cli.record.film import HEIGHT, WIDTH, Stage
-from rampart.cli.record.replaying import RecordedRun
+from rampart.cli.record.replaying import HEIGHT, WIDTH, RecordedRun, Stage
 from rampart.testing import free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose

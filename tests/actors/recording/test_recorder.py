@@ -278,9 +278,9 @@ def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
     node.take("rampart/k", b"")
 
 
-def test_gaps_are_told(port, tmp_path):
+def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(port, tmp_path):
     path = tmp_path / "run.mcap"
-    recorder = Recorder(port, path)
+    recorder = Recorder(port, path, wants=lambda key: "detection" in key)
     recorder.open()
     with AnsweringLauncher(port, time.monotonic()), running(recorder):
         robot = Robot(port)
@@ -289,10 +289,12 @@ def test_gaps_are_told(port, tmp_path):
         robot.send(1)
         wait_until(path.exists, 15, "it has not begun")
     robot.connection.close()
+    assert numbers(path) == []
     assert Summary(BagReader(path)).end["lost"] == '{"localization": 3}'
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
+    (["--topics", "detection/*", "nothing/like/it"], "--topics nothing/like/it: matches no topic"),
     (["--duration", "0"], "--duration 0: must be above 0"),
     (["--port", "31999"], "--port 31999: no run there")])
 def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments, words):

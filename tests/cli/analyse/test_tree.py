@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.cli import systems
-from rampart.cli.analyse.tree_verb import to_text
+from rampart.cli.analyse.tree_verbs import to_text
 from rampart.cli.main import main
 from rampart.files.plain_text import one_line
 from rampart.manager.drawing.diagram import Box, Diagram, covers

@@ -22,7 +22,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.clock import Clock
-from rampart.cli import following
+from rampart.cli import run_picture, session
 from rampart.cli.look import live_metrics
 from rampart.cli.look.live_foxglove import _watch
 from rampart.cli.look.live_metrics import Exposition, families
@@ -112,9 +112,9 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
             return {"nodes": {}, "guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
 
     monkeypatch.setattr(live_metrics, "sessions", one)
-    monkeypatch.setattr(following, "ProcessObserver", Observer)
+    monkeypatch.setattr(run_picture, "ProcessObserver", Observer)
     monkeypatch.setattr(live_metrics, "LOOK_S", 0.001)
-    monkeypatch.setattr(following, "draw", lambda _session, picture: picture.heard(
+    monkeypatch.setattr(run_picture, "draw", lambda _session, picture: picture.heard(
         ftm_topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
     exporter, stop = live_metrics.Exporter(), asyncio.Event()
     task = asyncio.create_task(exporter.follow(None, stop))
@@ -128,7 +128,7 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
 
 
 async def test_prometheus_is_answered_without_a_run(monkeypatch):
-    monkeypatch.setattr(following, "find_runs", list)
+    monkeypatch.setattr(session, "find_runs", list)
     port = free_port()
     serving = asyncio.create_task(live_metrics.metrics(
         Namespace(host="127.0.0.1", port=port, of=None)))

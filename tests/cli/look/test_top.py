@@ -17,10 +17,9 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.clock import Clock
-from rampart.cli.following import draw
 from rampart.cli.look.top import Frame, picture_json, screen
 from rampart.cli.osmosis.lines import OsmosisLines
-from rampart.cli.run_picture import RunPicture
+from rampart.cli.run_picture import RunPicture, draw
 from rampart.systems import DEFAULT
 
 MISSION = m.MissionStatus(

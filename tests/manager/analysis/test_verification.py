@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from rampart import STRATEGIES, Arbiter, Decision
-from rampart.cli.analyse import verify_verb
+from rampart.cli.analyse import decide_verbs
 from rampart.cli.main import main
 from rampart.manager.analysis import active_sets
 from rampart.manager.analysis.active_sets import ActiveSets, order_agrees_with_tree
@@ -289,7 +289,7 @@ def test_nonsense_is_refused_in_one_line(refused, monkeypatch):
 
 
 def test_the_command_prints_json_of_the_promised_shape(capsys, monkeypatch):
-    monkeypatch.setattr(verify_verb, "verify", lambda *asked, **_: verify(*asked, 1))
+    monkeypatch.setattr(decide_verbs, "verify", lambda *asked, **_: verify(*asked, 1))
     assert main(["verify", "paper", "--strategy", "guarded-repair", "--strict", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["permissiveness"] == {"guarded-repair": 88}
@@ -302,7 +302,7 @@ def test_the_command_prints_json_of_the_promised_shape(capsys, monkeypatch):
 
 def test_the_command_prints_a_table_and_the_traces_of_the_system_s_strategy(
         report, capsys, monkeypatch):
-    monkeypatch.setattr(verify_verb, "verify", lambda *_, **__: report)
+    monkeypatch.setattr(decide_verbs, "verify", lambda *_, **__: report)
     assert main(["verify", "paper", "--strict"]) == 1
     told = capsys.readouterr().out
     for words in ("127 active sets, ", "FAILS in 32", "90 of 127", "66 of 127",

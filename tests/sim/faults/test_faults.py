@@ -17,7 +17,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, FaultGate
 from rampart.actors.system.layout import published_keys
-from rampart.cli.look.topic_catalogue import resolve
+from rampart.cli.look.topic_verbs import resolve
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
