@@ -6,9 +6,7 @@ import asyncio
 import math
 import re
 from contextlib import asynccontextmanager
-from typing import Annotated
 
-import msgspec
 import pytest
 
 from rampart.actors.bus.fields import StickMessages
@@ -33,13 +31,6 @@ DRIVE = Panel(title="Drive", stick=("tank/hand:forward", "tank/hand:left"), held
 AT_REST = Hand(0.0)
 
 
-class Steps(Message):
-    """A motor that counts, and a name that somebody has to say."""
-
-    steps: Annotated[int, msgspec.Meta(ge=-10, le=100)]
-    name: str
-
-
 class Place(Message):
     """A number within."""
 
@@ -47,7 +38,6 @@ class Place(Message):
     count: int = 0
 
 
-STEPS = Topic("tank/steps", Steps, Qos.COMMAND, 0.0, "", "Steps of a motor.")
 PLACE = Topic("tank/place/{name}", Place, Qos.COMMAND, 0.0, "", "Where each of some is to go.")
 
 
@@ -58,21 +48,17 @@ class Driven(Actor):
     def hand(self, message: Hand, _header: Header) -> None:
         pass
 
-    @on(STEPS)
-    def steps(self, message: Steps, _header: Header) -> None:
-        pass
-
     @on(PLACE)
     def place(self, message: Place, _header: Header) -> None:
         pass
 
-    optional_inputs = (STEPS, PLACE, HAND)
+    optional_inputs = (PLACE, HAND)
 
 
 class Needs(Driven):
     """Cannot do without the stick."""
 
-    optional_inputs = (STEPS, PLACE)
+    optional_inputs = (PLACE,)
 
 
 class Rival(Actor):
@@ -150,7 +136,7 @@ def test_a_stick_of_the_page_s_class_or_of_a_member_of_a_family_has_its_topic_al
     (f"{FIELDS}\nscale = [1.0]", "scale = [1.0]: expected one number for each of tank/hand:forwar"),
     (f"{FIELDS}\nscale = [1.0, 0.0]", "expected numbers other than 0, at most 1e+09"),
     (f"{FIELDS}\nseconds = 3", "seconds does not apply to a stick; it takes held, scale"),
-    ('stick = ["tank/steps:steps"]', "no value for name; expected a default in its class"),
+    ('stick = ["tank/pump:busy_until_s"]', "no value for phase; expected a default in its class"),
     ('stick = ["tank/place/a:at.forward"]', "at.forward: not a field of Place; expected one of at"),
     (f"{FIELDS}\nscale = [1.0, 1.0]", "forward = -1 at full deflection: Expected `float` >= -0.5"),
 ])
