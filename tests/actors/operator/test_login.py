@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import httpx
 import msgspec
 import pytest
@@ -44,6 +46,7 @@ async def test_who_logs_in_gets_a_cookie_drives_and_logs_out_and_all_others_see_
         async with httpx.AsyncClient(base_url=f"http://{at}") as client:
             for path in ("/", "/app.js"):
                 assert (await client.get(path)).status_code == 200
+                assert (await client.get(path, headers={"host": "evil.example"})).status_code == 400
             for path in ("/other", f"/other?token={TOKEN}", "/logout", "/ws"):
                 refused = await client.get(path)
                 assert refused.status_code == 401
@@ -183,13 +186,18 @@ async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
 # ---- off loopback -------------------------------------------------------------------------------
 
 
-async def test_a_page_that_must_not_be_served_is_not_and_the_reason_reported(world):
-    for incarnation, (fields, why) in enumerate((
-            ({}, "needs a token"), ({"hmi_token": TOKEN}, "has to be encrypted"),
-            ({"hmi_token": TOKEN, "hmi_cert": "/no/cert", "hmi_key": "/no/key"},
-             "key /no/key: cannot be")), 1):
-        world.others.diagnostics.clear()
-        async with world.hmi(incarnation, hmi_host="0.0.0.0", **fields) as hmi:
-            await eventually(lambda: bool(world.others.diagnostics))
-            assert hmi._server is None
-        assert why in world.others.diagnostics[0].reason
+async def test_a_page_that_cannot_or_must_not_be_served_is_not_and_the_reason_reported(world):
+    everywhere = {"hmi_host": "0.0.0.0"}
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        for incarnation, (fields, why) in enumerate((
+                (everywhere, "needs a token"),
+                ({**everywhere, "hmi_token": TOKEN}, "has to be encrypted"),
+                ({**everywhere, "hmi_token": TOKEN, "hmi_cert": "/no/cert", "hmi_key": "/no/key"},
+                 "key /no/key: cannot be"),
+                ({"hmi_port": taken.getsockname()[1]},
+                 "Address already in use; choose another port")), 1):
+            world.others.diagnostics.clear()
+            async with world.hmi(incarnation, **fields) as hmi:
+                await eventually(lambda: bool(world.others.diagnostics))
+                assert hmi._server is None
+            assert why in world.others.diagnostics[0].reason
