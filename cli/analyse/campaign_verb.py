@@ -42,7 +42,6 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.defaults import PATIENCE_S
-from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
@@ -56,7 +55,7 @@ from rampart.sim.campaign.statistics import (
     total,
     varying_options,
 )
-from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.campaign.store import JobError, Run, Store, StoreError, execute
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit

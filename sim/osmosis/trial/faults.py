@@ -36,7 +36,7 @@ from rampart.actors.runtime.fault_watch import Order
 from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
-from rampart.sim.faults.wrong_numbers import Sizes
+from rampart.sim.faults.topic_faults import Sizes
 from rampart.sim.osmosis.robot import WHEEL_NAMES
 
 OBSTACLE = "obstacle-ahead"

@@ -22,11 +22,10 @@ from rampart.cli import systems
 from rampart.cli.analyse import campaign_verb
 from rampart.cli.main import main as rampart
 from rampart.sim.campaign.content import with_content
-from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.statistics import badness, rate, table, total, worst
-from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.campaign.store import JobError, Run, Store, StoreError, execute
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables as paper
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
@@ -98,17 +97,19 @@ def test_a_store_keeps_a_run_as_it_was_infinity_included(tmp_path):
     again.close()
 
 
-def test_a_file_that_is_no_store_or_one_of_another_format_is_refused_and_left_alone(tmp_path):
-    Store(tmp_path).close()
-    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
-        database.execute("update about set value = '99'")
+def test_a_file_that_is_no_store_or_has_other_runs_is_refused_and_left_alone(tmp_path):
+    store = Store(tmp_path)
+    store.add(Job(row="x"), result())
+    with sqlite3.connect(store.path) as database:
+        database.execute("update runs set result = 'of another version'")
     database.close()
-    with pytest.raises(StoreError, match="format '99', expected 2"):
-        Store(tmp_path)
-    (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
+    with pytest.raises(StoreError, match=r"cannot be used: .*; choose another --out"):
+        list(store.runs())
+    store.close()
+    store.path.write_text("my shopping list\n" * 100)
     with pytest.raises(StoreError, match="not a store of campaign results"):
         Store(tmp_path)
-    assert "shopping" in (tmp_path / "runs.sqlite").read_text()
+    assert "shopping" in store.path.read_text()
 
 
 def test_what_is_done_is_not_done_again_and_a_job_that_makes_no_sense_costs_no_other(tmp_path):

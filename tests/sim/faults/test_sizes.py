@@ -13,7 +13,7 @@ from rampart.actors.runtime.corruption import corrupt
 from rampart.manager.spec.specification import SpecificationError, parse_specification
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.faults import faults_of
-from rampart.sim.faults.wrong_numbers import Sizes, plausible_offsets
+from rampart.sim.faults.topic_faults import Sizes, plausible_offsets
 from tests import TANK
 
 
