@@ -25,8 +25,7 @@ from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.unseen import watch
 from rampart.cli.output import FORMAT, UsageError
-from rampart.cli.page_options import audited
-from rampart.cli.run_options import ERROR_LOG, refuse
+from rampart.cli.run_options import ERROR_LOG, audited, refuse
 from rampart.files.plain_text import one_line
 
 _LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "patience",

@@ -34,8 +34,7 @@ from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import load_application
 from rampart.actors.system.topics import system_topics
 from rampart.cli.output import FORMAT, UsageError
-from rampart.cli.page_options import audited
-from rampart.cli.run_options import ERROR_LOG, of_one_process, parse, plan_of, refuse
+from rampart.cli.run_options import ERROR_LOG, audited, of_one_process, parse, plan_of, refuse
 from rampart.files import loading, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec

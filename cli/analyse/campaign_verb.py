@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from importlib.metadata import entry_points
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -49,7 +48,6 @@ from rampart.sim.campaign.report import Campaign, write_campaign_report
 from rampart.sim.campaign.statistics import (
     Rate,
     Row,
-    Spread,
     as_json,
     table,
     total,
@@ -60,8 +58,8 @@ from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
-from rampart.sim.runs.report import NONE, in_words, margin_text
-from rampart.sim.runs.trial import Trial, trial_class
+from rampart.sim.runs.report import NONE, in_words
+from rampart.sim.runs.trial import trial_class
 from rampart.sim.virtual.network import NETWORKS, find_network
 
 _LOG_S = 60.0
@@ -406,28 +404,13 @@ def _show_rows(spec: SystemSpec, runs: Sequence[Run], rows: Sequence[Row]) -> No
     shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
                                           row.success.share if row.success.of else 2.0))
     verdicts = ("success", "safe", "worst") if trial.judges else ("restarts",)
-    margins = ("smallest margin",) if trial.margins else ()
-    print_table(
-        ("fault", *options, "FTM", "strategy", "runs", "no effect", *verdicts, "detected after",
-         "first by", *margins),
-        [_cells(row, options, trial) for row in shown[:_SHOWN]])
+    print_table(("fault", *options, "FTM", "strategy", "runs", "no effect", *verdicts), [
+        (row.fault, *(row.options.get(name, NONE) for name in options), "yes" if row.ftm else "no",
+         row.strategy or "-", row.runs, row.ineffective,
+         *((_share(row.success), _share(row.safe), row.worst) if row.judged else (row.restarts,)))
+        for row in shown[:_SHOWN]])
     if len(shown) > _SHOWN:
         say(f"... and {len(shown) - _SHOWN} rows more, in the report")
-
-
-def _cells(row: Row, options: Sequence[str], trial: type[Trial]) -> tuple[Any, ...]:
-    margin = min((s.least for s in row.margins.values() if s), default=None)
-    margins = (margin_text(margin, trial.margin_unit, None),) if trial.margins else ()
-    return (row.fault, *(row.options.get(name, NONE) for name in options),
-            "yes" if row.ftm else "no", row.strategy or "-", row.runs, row.ineffective,
-            *((_share(row.success), _share(row.safe), row.worst) if row.judged
-              else (row.restarts,)), _milliseconds(row.detected_after_s), _detecting(row), *margins)
-
-
-def _detecting(row: Row) -> str:
-    """Return the module that detected most often first, and those expected that stayed idle."""
-    first = next(iter(row.first_by), NONE)
-    return "; ".join([first, *(f"{name} idle: {number}" for name, number in row.idle.items())])
 
 
 def _share(found: Rate) -> str:
@@ -437,7 +420,3 @@ def _share(found: Rate) -> str:
 def _rate(found: Rate) -> str:
     return (f"{found.count} of {found.of} ({100 * found.share:.1f} %, 95 % interval "
             f"{100 * found.low:.2f} to {100 * found.high:.2f} %)" if found.of else "none")
-
-
-def _milliseconds(found: Spread | None) -> str:
-    return "-" if found is None else f"{found.median * 1e3:.0f} ms, at most {found.most * 1e3:.0f}"

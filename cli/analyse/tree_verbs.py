@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from rampart.cli.output import (
 )
 from rampart.cli.verbs import JSON, add_verb, flag, option, whole, word
 from rampart.files.reading import read_bytes
-from rampart.manager.analysis.barriers import Guarded, guard, outlook
+from rampart.manager.analysis.barriers import guard
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
 from rampart.manager.analysis.open_psa import MAX_BYTES, read_open_psa, write_open_psa
@@ -91,8 +91,6 @@ def add(verbs: Any) -> None:
              word("--top", "GATE", "top gate of an Open-PSA file", ""),
              whole("--max-order", "K", "leave out sets with more than K events"),
              whole("--limit", "N", f"list at most N sets (default: {_LIMIT})", _LIMIT),
-             option("--active", nargs="+", default=[], metavar="FTM",
-                    help="show what is left before the top if these mechanisms are active"),
              word("--export", "FILE", "write the fault tree in Open-PSA format"), JSON)
 
 
@@ -131,16 +129,15 @@ def cut_sets(options: argparse.Namespace) -> int:
     """Do what the options ask for.
 
     Find the minimal sets of events that cause the top event of a fault tree. For
-    a system, also show the mechanisms that are barriers on each set, and the single
-    events that are left before the top. Sets are counted without listing them, so
-    the count may be in the millions. docs/explanation/fault-trees.md explains it.
+    a system, also show the mechanisms that are barriers on each set. Sets are counted
+    without listing them, so the count may be in the millions.
+    docs/explanation/fault-trees.md explains it.
 
     Examples:
       rampart cut-sets                              # the default system
       rampart cut-sets paper
       rampart cut-sets plant.xml --count --json     # an Open-PSA file
       rampart cut-sets plant.xml --top g12 --max-order 2
-      rampart cut-sets --active FTM2                # what is left if FTM2 is active
       rampart cut-sets --export osmosis.xml         # for other tools
     """
     for name in ("limit", "max_order"):
@@ -148,14 +145,12 @@ def cut_sets(options: argparse.Namespace) -> int:
             raise UsageError(f"--{name.replace('_', '-')} {getattr(options, name)}: must be 0 or "
                              "more")
     spec, formula = _load(options)
-    if options.active or options.export:
+    if options.export:
         if spec is None:
-            raise UsageError(f"{options.file}: --active and --export need a system spec")
-        if options.export:
-            Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
-            say(f"{spec.name}: {len(spec.events)} events written to {options.export}")
-            return 0
-        return _show_outlook(spec, options.active, as_json=options.json)
+            raise UsageError(f"{options.file}: --export needs a system spec")
+        Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
+        say(f"{spec.name}: {len(spec.events)} events written to {options.export}")
+        return 0
     try:
         with progress() as show:
             found = CutSets(formula, progress=show, max_order=options.max_order)
@@ -207,7 +202,8 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
             say(f"  {count} of {size} event{'s' if size != 1 else ''}")
     say()
     if guarded:
-        _print_barriers("events", guarded)
+        print_table(("barriers", "events", "mechanisms, nearest to the top first"),
+                    [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
         bare = [g for g in guarded if len(g.barriers) < 2]
         if bare:
             say_text("\nfewer than two barriers:")
@@ -220,27 +216,3 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
     if len(sets) < found.count:
         say_text(f"\n{len(sets)} shown; --limit N shows more")
     return 0
-
-
-def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
-    spec.build_mechanisms().sort(active)
-    view = outlook(spec, active)
-    if as_json:
-        print_json(view)
-        return 0
-    top = spec.build_fault_tree().top
-    if not view.occurred:
-        say("no mechanism is active: no event has occurred")
-    for name, barriers in view.left.items():
-        event = next(m.event for m in spec.mechanisms if m.name == name)
-        say(f"{event} has occurred ({name} is active); left before {top}: "
-            f"{', '.join(barriers) or 'nothing'}")
-    say()
-    say(f"single events that would now lead to {top}, and the idle barriers between:")
-    _print_barriers("event", view.next_events)
-    return 0
-
-
-def _print_barriers(events: str, guarded: Iterable[Guarded]) -> None:
-    print_table(("barriers", events, "mechanisms, nearest to the top first"),
-                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])

@@ -10,7 +10,7 @@ import re
 import resource
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,7 +74,7 @@ def doctor(options: argparse.Namespace) -> int:
 
     exit code: 0 a run can start, 1 none can
     """
-    findings = [finding for look in LOOKS for finding in look()]
+    findings = list(look())
     print_rows(("", "what", "found", "without it"), [
         (_SHOWN[finding.state], finding.what, finding.found, finding.cost)
         for finding in findings], findings, as_json=options.json)
@@ -86,43 +86,26 @@ def _finding(what: str, found: str, *, there: bool, cost: str, needed: bool = Fa
                    "" if there else cost)
 
 
-def python() -> Iterator[Finding]:
-    """Check the interpreter."""
+def look() -> Iterator[Finding]:
+    """Check interpreter, kernel, processors, memory, folder, limits, libraries and programs."""
     yield _finding("Python", platform.python_version(), there=sys.version_info >= LEAST_PYTHON,
                    cost=f"nothing runs; {'.'.join(map(str, LEAST_PYTHON))} or later", needed=True)
-
-
-def kernel() -> Iterator[Finding]:
-    """Check the kernel."""
     is_linux, release = sys.platform == "linux", platform.release()
-    number = tuple(int(part) for part in release.split("-")[0].split(".")[:2] if part.isdigit())
-    yield _finding("Linux", f"{platform.system()} {release}", there=is_linux and number >= (5, 9),
+    version = tuple(int(part) for part in release.split("-")[0].split(".")[:2] if part.isdigit())
+    yield _finding("Linux", f"{platform.system()} {release}", there=is_linux and version >= (5, 9),
                    cost="no run on real processes; --virtual works", needed=True)
-
-
-def processors() -> Iterator[Finding]:
-    """Check processors and memory."""
     count, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     yield _finding("processors", f"{count}, load {load:.1f}", there=count >= 2 and load < count,
                    cost="other programs and too few processors make messages late, and the robot "
                         "stops: end them, or use --virtual, or --rate 0.5 for a simulated robot")
     meminfo = Path("/proc/meminfo").read_text(encoding="ascii")
-    free = int(re.findall(r"MemAvailable:\s+(\d+) kB", meminfo)[0]) / 1e3
-    yield _finding("memory", f"{free:,.0f} MB available", there=free >= NEEDED_MB,
+    free_mb = int(re.findall(r"MemAvailable:\s+(\d+) kB", meminfo)[0]) / 1e3
+    yield _finding("memory", f"{free_mb:,.0f} MB available", there=free_mb >= NEEDED_MB,
                    cost=f"the full system takes {NEEDED_MB} MB")
-
-
-def folders() -> Iterator[Finding]:
-    """Check the file system of a run's folder."""
     place = Path(os.environ.get("XDG_RUNTIME_DIR") or "/dev/shm")  # noqa: S108 only checked
-    can = os.access(place, os.W_OK)
-    free = shutil.disk_usage(place).free / 1e6 if can else 0.0
-    yield _finding("folder of a run", f"{place}, {free:,.0f} MB free" if can else f"{place}: no",
-                   there=can and free > 10, cost="no run starts", needed=True)
-
-
-def limits() -> Iterator[Finding]:
-    """Check the limits of this user."""
+    room_mb = shutil.disk_usage(place).free / 1e6 if os.access(place, os.W_OK) else 0.0
+    yield _finding("folder of a run", f"{place}, {room_mb:,.0f} MB to write", there=room_mb > 10,
+                   cost="no run starts", needed=True)
     _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = needed_of(resource.RLIMIT_NOFILE, PROCESSES)
     yield _finding("open files", f"hard limit {files}", there=files >= needed, needed=True,
@@ -132,25 +115,13 @@ def limits() -> Iterator[Finding]:
     yield _finding("niceness -10", "permitted" if may else "not permitted", there=may,
                    cost="a busy machine slows the simulated world, not the controller alone: "
                         "ulimit -e 30")
-
-
-def libraries() -> Iterator[Finding]:
-    """Check the libraries of extras."""
     for extra, (module, cost) in EXTRAS.items():
         there = importlib.util.find_spec(module) is not None
         yield _finding(f"extra {extra}", module if there else "not installed", there=there,
                        cost=cost)
-
-
-def programs() -> Iterator[Finding]:
-    """Check other programs."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
     yield _finding("Chromium", chromium or "not found", there=chromium is not None,
                    cost="tests of the operator's page are skipped")
     distribution = os.environ.get("ROS_DISTRO", "")
     yield _finding("ROS 2", distribution or "not sourced", there=bool(distribution),
                    cost="only `rampart ros2 check` compares with an installation")
-
-
-LOOKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    python, kernel, processors, folders, limits, libraries, programs)

@@ -105,7 +105,6 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["topic", "echo", "localization/pose/x"], ["no run found"]),
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
     (["cut-sets", "nowhere.xml"], ["nowhere.xml: No such file or directory"]),
-    (["cut-sets", "--active", "FTM99"], ["unknown mechanism 'FTM99'; known: FTM1"]),
     (["cut-sets", "--limit", "-1"], ["--limit -1: must be 0 or more"]),
     (["cut-sets", "--top", "nobody"], ["unknown top 'nobody'"]),
     *((["adapt", "retune", "RM2", f"deadline_s={value}"], ["deadline_s", "finite"])

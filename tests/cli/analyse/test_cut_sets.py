@@ -42,13 +42,6 @@ def test_what_is_exported_is_read_again(rampart, tmp_path):
     assert there["by_size"] == back["by_size"]
 
 
-def test_what_is_left_before_the_top(rampart):
-    done = rampart("cut-sets", "paper", "--active", "FTM2", "FTM1", "--json")
-    view = json.loads(done.stdout)
-    assert view["left"] == {"FTM1": [], "FTM2": []}
-    assert view["next_events"][0]["barriers"] == []
-
-
 def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(refused, tmp_path):
     file = tmp_path / "x.xml"
     file.write_text("<!DOCTYPE x [<!ENTITY a 'b'>]><opsa-mef>&a;</opsa-mef>")

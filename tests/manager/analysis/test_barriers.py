@@ -1,6 +1,6 @@
 """Which mechanisms stand between causes and the top event."""
 
-from rampart.manager.analysis.barriers import guard, outlook
+from rampart.manager.analysis.barriers import guard
 from rampart.manager.model.fault_tree import Event, FaultTree
 from tests.manager.bench import paper
 
@@ -25,21 +25,3 @@ def test_an_event_that_is_kept_from_occurring_does_not_spread():
     assert "top" not in tree.occurring(["a", "b", "c"], "g")
     assert "top" not in tree.occurring(["a", "b", "c"], "b")
     assert "top" in tree.occurring(["a", "b", "c", "d"], "b")
-
-
-def test_when_nothing_is_active_every_single_cause_has_all_its_barriers():
-    view = outlook(paper(), ())
-    assert view.occurred == ()
-    assert view.left == {}
-    barriers = {g.events[0]: g.barriers for g in view.next_events}
-    assert barriers["control_node_crash"] == ("FTM1", "FTM2", "FTM4")
-    assert [len(g.barriers) for g in view.next_events] == [1, 1, 1, 2, 3, 3, 3]
-
-
-def test_an_active_mechanism_is_a_barrier_no_more_and_its_event_has_occurred():
-    view = outlook(paper(), ["FTM2", "FTM4"])
-    assert view.occurred == ("command_not_updated", "control_node_crash")
-    assert view.left == {"FTM2": ("FTM1",), "FTM4": ("FTM1",)}
-    barriers = {g.events[0]: g.barriers for g in view.next_events}
-    assert "control_node_crash" not in barriers
-    assert barriers["non_control_node_crash"] == ("FTM1", "FTM5")
