@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -34,17 +35,8 @@ EDGES = [("A", "B"), ("B", "C"), ("C", "D"), ("D", "A")]
 # ---- closures -----------------------------------------------------------------------------------
 
 
-def samples(nodes, edges, step_m=0.1):
-    for a, b in edges:
-        count = max(2, math.ceil(math.dist(nodes[a], nodes[b]) / step_m) + 1)
-        for share in np.linspace(0.0, 1.0, count):
-            yield tuple(nodes[a][i] + share * (nodes[b][i] - nodes[a][i]) for i in (0, 1))
-
-
-def on_graph(point, nodes, edges):
-    return any(
-        math.dist(a, point) + math.dist(point, b) <= math.dist(a, b) + 1e-6
-        for a, b in ((nodes[x], nodes[y]) for x, y in edges))
+def lines(nodes, edges):
+    return shapely.MultiLineString([(nodes[a], nodes[b]) for a, b in edges])
 
 
 @given(st.lists(st.tuples(st.floats(-1, 21), st.floats(-1, 21)), max_size=3),
@@ -52,14 +44,11 @@ def on_graph(point, nodes, edges):
 def test_what_is_left_of_the_graph_is_what_is_not_near_a_closed_place(places, gap_m):
     nodes, edges = without(RING, EDGES, places, gap_m)
     assert set(RING) <= set(nodes)
-    for point in samples(RING, EDGES, 0.5):
-        nearest_m = min((math.dist(point, place) for place in places), default=math.inf)
-        if nearest_m > gap_m + 0.1:
-            assert on_graph(point, nodes, edges), "open, so it is still there"
-        elif nearest_m < gap_m - 0.01:
-            assert not on_graph(point, nodes, edges), "closed, so it is gone"
-    for point in samples(nodes, edges, 0.5):
-        assert on_graph(point, RING, EDGES), "nothing is added"
+    whole, left, closed = lines(RING, EDGES), lines(nodes, edges), shapely.MultiPoint(places)
+    assert left.difference(whole.buffer(1e-6)).length < 1e-3, "nothing is added"
+    assert left.intersection(closed.buffer(gap_m - 0.01)).length < 1e-3, "closed, so it is gone"
+    gone = whole.difference(left.buffer(1e-6))
+    assert gone.difference(closed.buffer(gap_m + 0.1)).length < 1e-3, "open, so it is there"
 
 
 # ---- blockage -----------------------------------------------------------------------------------
