@@ -14,9 +14,11 @@ from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPos
 from rampart.testing import Ear, table
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
+    STAMPED,
     Voted,
     disturbed,
     fault,
+    mis_stamped,
     watch,
 )
 from tests.actors.osmosis.detection.lane import LANE
@@ -29,6 +31,15 @@ def follow(*faults, blind_s=10.0, blind_m=5.0) -> Voted:
     voted = Voted(VotedPosition(0.05, blind_s, blind_m))
     watch(disturbed(faults), voted)
     return voted
+
+
+@pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
+def test_one_wrong_stamp_is_over_when_another_source_fails_later(topic):
+    later = "absolute-pose-bias" if topic is topics.GPS else "gps-bias"
+    items, voted = disturbed([(fault(later), FROM_S + 4.0, math.inf)]), Voted()
+    watch(mis_stamped(items, topic, "far ahead", FROM_S, once=True), voted, to_s=FROM_S + 10.0)
+    assert voted.worst_m < 0.4
+    assert voted.unknown_s < 0.45
 
 
 @pytest.mark.parametrize("names", [
