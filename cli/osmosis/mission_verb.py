@@ -10,6 +10,7 @@ from typing import Any
 from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.cli.osmosis.lines import mission_in_words
 from rampart.cli.output import NoEffectError, UsageError, print_json, say
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_verb, option, word
@@ -82,7 +83,7 @@ async def mission(options: argparse.Namespace) -> int:
     if not answer.accepted:
         raise NoEffectError(f"{order.action.value} refused: {answer.reason}")
     if not options.json:
-        say(f"{order.action.value} obeyed; {in_words(status)}")
+        say(f"{order.action.value} obeyed; mission {mission_in_words(status)}")
     return 0
 
 
@@ -97,16 +98,6 @@ def checked_reason(text: str, option: str = "--reason") -> str:
         raise UsageError(f"{option} {text[:40]!r}: must be one line of 1 to {MAX_REASON} printable "
                          "characters")
     return reason
-
-
-def in_words(status: m.MissionStatus | None) -> str:
-    """Return the state of the mission in words."""
-    if status is None:
-        return "the Mission Manager has not published its status since"
-    step = f", step {min(status.step + 1, len(status.goals))} of {len(status.goals)}" if (
-        status.phase in (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED)) else ""
-    why = f": {status.reason}" if status.reason else ""
-    return f"mission {status.name} is {status.phase.value}{step}{why}"
 
 
 class _Asked:

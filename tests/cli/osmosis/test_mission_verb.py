@@ -50,7 +50,8 @@ async def test_an_order_reaches_the_mission_once_with_its_reason(run):
     assert told["mission"].items() >= {"mission_id": "r1/first", "name": "AB", "phase": "running",
                                        "goals": 2}.items()
     out = await run.out("mission", "pause", "--reason", "runway in use")
-    assert out == "pause obeyed; mission AB is paused, step 1 of 2: operator: runway in use\n"
+    assert out == ("pause obeyed; mission AB paused, step 1 of 2, 0 lights measured: "
+                   "operator: runway in use\n")
     assert run.node.state.phase is MissionPhase.PAUSED
 
 
