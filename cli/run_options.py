@@ -45,8 +45,13 @@ from rampart.actors.web.access import (
 )
 from rampart.actors.web.listening import PortError, listen
 from rampart.actors.web.tls import Certificate, TlsError, days_left, holds_key, load
-from rampart.actors.web.token_file import SecretError, read_secret
-from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visitors
+from rampart.actors.web.visitors import (
+    SecretError,
+    VisitorError,
+    lists_visitors,
+    read_secret,
+    read_visitors,
+)
 from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive, warn
 from rampart.cli.verbs import (

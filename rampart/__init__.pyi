@@ -46,9 +46,9 @@ from rampart.manager.strategies.decision import Decision as Decision
 from rampart.manager.strategies.decision import Strategy as Strategy
 from rampart.manager.strategies.registry import STRATEGIES as STRATEGIES
 from rampart.manager.strategies.registry import decide as decide
-from rampart.sim.faults.disturbance import Disturbance as Disturbance
-from rampart.sim.faults.disturbance import Fault as Fault
 from rampart.sim.faults.faults import Faults as Faults
 from rampart.sim.faults.scenario import ScenarioError as ScenarioError
+from rampart.sim.faults.topic_faults import Disturbance as Disturbance
+from rampart.sim.faults.topic_faults import Fault as Fault
 from rampart.sim.runs.judge import Judge as Judge
 from rampart.sim.runs.judge import Verdict as Verdict

@@ -31,7 +31,6 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.history import read_history
 from rampart.actors.ftm.keeping_up import LINE_S, KeepingUp
-from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.panels import (
@@ -42,6 +41,7 @@ from rampart.actors.operator.panels import (
     read_panels,
     steered,
 )
+from rampart.actors.operator.picture import Bounds
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
 from rampart.actors.operator.state import STALE_S, HmiState

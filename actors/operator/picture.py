@@ -4,18 +4,64 @@ Each change gives the picture a new version. A page at version *v* receives the 
 lines that changed since *v*; a new page (version 0) receives everything. So nothing has to be kept
 for a page that was suspended or too slow: it receives the newest contents and no backlog.
 
-A section is cut to its bounds (`bounds`) and encoded when it is first sent, once for all pages.
+A section is cut to its bounds and encoded when it is first sent, once for all pages: messages on
+the bus can be larger than what a person can read. The page shows the number of missing entries.
+Each list has its own bound, so a long one does not displace others, e.g. the recoveries that wait
+for a reset.
+
+A text becomes one printable line. A line break could forge a line of the log, and a mark that
+changes the direction of writing could forge a name.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 import msgspec
 
-from rampart.actors.operator.bounds import LINE, SHOWN, Bounds
+from rampart.files.plain_text import one_line
+
+MAX_NAME = 100
+"""Longest name."""
+
+
+class Bounds(msgspec.Struct, frozen=True):
+    """Bounds of a value.
+
+    Attributes:
+        text: characters of a text.
+        items: entries of a list or mapping.
+    """
+
+    text: int = 500
+    items: int = 200
+
+    def fit(self, value: Any) -> tuple[Any, int]:
+        """Return a value cut to the bounds, in types of JSON, and the number of missing entries."""
+        left_out = 0
+
+        def cut(value: Any) -> Any:
+            nonlocal left_out
+            if isinstance(value, str):
+                return one_line(value, self.text)
+            if not isinstance(value, dict | list | tuple):
+                return value
+            left_out += max(0, len(value) - self.items)
+            if isinstance(value, dict):
+                return {cut(str(key)): cut(entry)
+                        for key, entry in islice(value.items(), self.items)}
+            return [cut(entry) for entry in value[:self.items]]
+
+        return cut(msgspec.to_builtins(value)), left_out
+
+
+SHOWN = Bounds()
+LINE = Bounds(items=40)
+"""Bounds of a line of a log."""
+
 
 JOURNAL_LINES = 60
 JOURNAL_BYTES = 100_000

@@ -17,8 +17,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm.narrator import Line, Narrator
-from rampart.actors.operator.bounds import SHOWN, Bounds
-from rampart.actors.operator.picture import Picture
+from rampart.actors.operator.picture import SHOWN, Bounds, Picture
 from rampart.files.plain_text import one_line
 from rampart.manager.strategies.registry import decision_in_words
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 from rampart.actors.web.access import plain_address
-from rampart.actors.web.token_file import SecretError, file_state, read_private
+from rampart.actors.web.visitors import SecretError, file_state, read_private
 
 _MAX_BYTES = 1_000_000
 _ROUNDS = 4

@@ -42,9 +42,8 @@ from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.defaults import PATIENCE_S
 from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
-from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.report import Campaign, write_campaign_report
+from rampart.sim.campaign.report import Campaign, NamedCampaign, write_campaign_report
 from rampart.sim.campaign.statistics import (
     Rate,
     Row,
@@ -54,10 +53,10 @@ from rampart.sim.campaign.statistics import (
     varying_options,
 )
 from rampart.sim.campaign.store import JobError, Run, Store, StoreError, execute
-from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
+from rampart.sim.faults.topic_faults import UnknownFaultError
 from rampart.sim.runs.report import NONE, in_words
 from rampart.sim.runs.trial import trial_class
 from rampart.sim.virtual.network import NETWORKS, find_network

@@ -31,10 +31,9 @@ from rampart.cli.output import (
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
-from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.topic_faults import modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import Disturbance, Fault, modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"

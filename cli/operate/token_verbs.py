@@ -19,9 +19,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.web.token_file import SecretError
 from rampart.actors.web.visitors import (
     Role,
+    SecretError,
     VisitorError,
     check_name,
     check_role,

@@ -9,7 +9,7 @@ from typing import Any, Self
 from rampart.cli.output import UsageError, print_table, say
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.job import Job
-from rampart.sim.campaign.named import NamedCampaign, Section
+from rampart.sim.campaign.report import NamedCampaign, Section
 from rampart.sim.campaign.statistics import Row
 from rampart.sim.campaign.store import Run
 from rampart.sim.osmosis.trial.paper_tables import (

@@ -19,8 +19,16 @@ from rampart.actors.system.layout import published_keys
 from rampart.actors.system.members import application_class, import_class
 from rampart.actors.system.topics import find_topic, system_topics
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import NONSENSE, READING, Sizes, closed, topic_fault
+from rampart.sim.faults.topic_faults import (
+    NONSENSE,
+    READING,
+    Disturbance,
+    Fault,
+    Sizes,
+    UnknownFaultError,
+    closed,
+    topic_fault,
+)
 
 PROCESS_FAULTS = ("kill", "stop", "wedge", "slow", "hang")
 

@@ -1,4 +1,7 @@
-"""Systematic faults: every topic that a node publishes, in every mode, as `MODE:TOPIC`.
+"""Faults on topics: named disturbances, and every topic in every mode, as `MODE:TOPIC`.
+
+A disturbance acts in the process that publishes its topic (`rampart.actors.runtime.injection`), so
+the rest of the system receives what it would receive after a real failure of that node.
 
 `corrupt:TOPIC` adds a constant offset to every number in a message, also in nested structs,
 sequences and arrays. Each offset is drawn once per fault, from a range that is plausible for its
@@ -20,18 +23,93 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from random import Random
 from typing import Any, NamedTuple
 
 import msgspec
 
 from rampart.actors.bus.bounds import narrow_range
+from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.runtime.corruption import InjectionError, check_fields, field_types, is_array
 from rampart.actors.runtime.injection import MODES, UNTOUCHED
 from rampart.actors.system.topics import find_topic
-from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+
+
+class UnknownFaultError(ValueError):
+    """Unknown name of a fault; the message is one line, with a hint to the known ones."""
+
+
+class Disturbance(msgspec.Struct, frozen=True):
+    """Disturbance of one topic; the fields are those of `Injection`."""
+
+    topic: str
+    mode: str
+    delay_s: float = 0.0
+    set_fields: Mapping[str, Any] = {}
+    ramp_fields: Mapping[str, float] = {}
+    keep_ends: tuple[str, ...] = ()
+    add_fields: Mapping[str, float] = {}
+    noise_fields: Mapping[str, float] = {}
+    share: float = 1.0
+    on_s: float = 0.0
+    off_s: float = 0.0
+    seed: int = 0
+    stamp_s: float = 0.0
+
+    def order(self, injection: str, duration_s: float) -> Injection:
+        """Return the message that orders it, with an id and a duration in simulated seconds."""
+        return Injection(injection, duration_s=duration_s, **msgspec.structs.asdict(self))
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """A named fault.
+
+    Args:
+        name: As typed by the user.
+        title: One line for people.
+        disturbances: Its effects.
+        detected_by: Detection modules that should detect it; empty if none should.
+        duration_s: Default duration, simulated seconds; infinity for permanent.
+        group: Its part of the catalogue.
+    """
+
+    name: str
+    title: str
+    disturbances: tuple[Disturbance, ...]
+    detected_by: tuple[str, ...]
+    duration_s: float
+    group: str = ""
+
+    def orders(self, injection: str, duration_s: float | None = None) -> tuple[Injection, ...]:
+        """Return the injections that make up the fault.
+
+        Args:
+            injection: Id; several disturbances get "ID.1", "ID.2" and so on.
+            duration_s: Simulated seconds, infinity for permanent; None for the default.
+        """
+        lasts_s = self.duration_s if duration_s is None else duration_s
+        several = len(self.disturbances) > 1
+        return tuple(d.order(f"{injection}.{i}" if several else injection, lasts_s)
+                     for i, d in enumerate(self.disturbances, start=1))
+
+    def varied(self, *, share: float | None = None, on_s: float | None = None,
+               off_s: float | None = None, seed: int | None = None) -> Fault:
+        """Return the fault for a share of the messages, intermittent, or with another seed.
+
+        Args:
+            share: Probability that a message is affected.
+            on_s: How long an intermittent fault is in force, simulated seconds.
+            off_s: How long it is absent in between, simulated seconds.
+            seed: Of the first disturbance; the others get the next ones. None keeps the seeds.
+        """
+        given = {"share": share, "on_s": on_s, "off_s": off_s}
+        changed = {name: value for name, value in given.items() if value is not None}
+        return msgspec.structs.replace(self, disturbances=tuple(
+            msgspec.structs.replace(d, **changed, seed=d.seed if seed is None else seed + i)
+            for i, d in enumerate(self.disturbances)))
+
 
 GROUP, READING = "topic", "reading"
 DURATION_S = 10.0

@@ -29,8 +29,8 @@ from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
 from rampart.manager.spec.adaptation import ChangeError, parse_value
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
-from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
+from rampart.sim.faults.topic_faults import UnknownFaultError
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import CELL, ROOT, TANK
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML

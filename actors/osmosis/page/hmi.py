@@ -22,10 +22,10 @@ from typing import Any
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.bounds import MAX_NAME
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.panels import Panel
+from rampart.actors.operator.picture import MAX_NAME
 from rampart.actors.operator.requests import REQUESTS, Name, Pending, RefusedError, Request
 from rampart.actors.operator.state import HmiState
 from rampart.actors.osmosis import messages as m

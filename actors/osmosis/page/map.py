@@ -10,7 +10,7 @@ from itertools import islice
 
 import msgspec
 
-from rampart.actors.operator.bounds import MAX_NAME
+from rampart.actors.operator.picture import MAX_NAME
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
 from rampart.files.plain_text import one_line

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rampart.actors.operator.bounds import MAX_NAME, Bounds
+from rampart.actors.operator.picture import MAX_NAME, Bounds
 from rampart.actors.operator.state import Heard, HmiState
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.messages import LaserScan

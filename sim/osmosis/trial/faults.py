@@ -33,10 +33,9 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind
 from rampart.actors.runtime.fault_watch import Order
-from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
-from rampart.sim.faults.topic_faults import Sizes
+from rampart.sim.faults.topic_faults import Disturbance, Fault, Sizes
 from rampart.sim.osmosis.robot import WHEEL_NAMES
 
 OBSTACLE = "obstacle-ahead"

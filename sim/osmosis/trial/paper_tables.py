@@ -28,7 +28,7 @@ from markupsafe import Markup
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import decide
 from rampart.sim.campaign.job import Job
-from rampart.sim.campaign.named import Section
+from rampart.sim.campaign.report import Section
 from rampart.sim.campaign.statistics import NO_EFFECT, verdict, worst
 from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import PlannedFault

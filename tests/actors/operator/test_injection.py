@@ -19,9 +19,8 @@ from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import systems
-from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
-from rampart.sim.faults.topic_faults import modes_of
+from rampart.sim.faults.topic_faults import Disturbance, Fault, modes_of
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.porter_actors import write_porter_system
 

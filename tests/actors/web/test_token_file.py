@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.web.token_file import MAX_BYTES, SecretError, read_secret
+from rampart.actors.web.visitors import SECRET_BYTES, SecretError, read_secret
 from tests.other_user import NOBODY, needs_root
 
 TOKEN = "secret-of-the-hangar-7"
@@ -48,7 +48,7 @@ def test_a_file_of_somebody_else_is_refused(file):
 
 
 @pytest.mark.parametrize("content", [
-    b"", b"\n \n", f"{TOKEN}\n{TOKEN}".encode(), b"x" * (MAX_BYTES + 1), b"\xff\xfe" * 10,
+    b"", b"\n \n", f"{TOKEN}\n{TOKEN}".encode(), b"x" * (SECRET_BYTES + 1), b"\xff\xfe" * 10,
     "ключ-от-ангара-семь".encode()])
 def test_what_is_not_one_plain_line_is_refused(file, content):
     file.write_bytes(content)

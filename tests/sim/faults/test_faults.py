@@ -18,8 +18,13 @@ from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, FaultGate
 from rampart.actors.system.layout import published_keys
 from rampart.cli.look.topic_verbs import resolve
-from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import (
+    Disturbance,
+    Fault,
+    UnknownFaultError,
+    modes_of,
+    systematic_faults,
+)
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, OsmosisFaults
 from tests.osmosis_system import shipped_system

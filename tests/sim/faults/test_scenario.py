@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
 from rampart.sim.campaign.plan import fault_groups
-from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import OnProcess, PlannedFault, ScenarioError, parse_fault
 from rampart.sim.faults.scenario import action_of as action_in
+from rampart.sim.faults.topic_faults import UnknownFaultError
 from rampart.sim.osmosis.trial.faults import OsmosisFaults, SuddenObstacle
 
 SYSTEM = systems.load(None)

@@ -24,7 +24,7 @@ from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.detection.area.estimation_error import EstimationMonitor
 from rampart.actors.osmosis.detection.area.voted_area import VotedPosition
 from rampart.actors.runtime.injection import FaultGate, Outgoing
-from rampart.sim.faults.disturbance import Fault
+from rampart.sim.faults.topic_faults import Fault
 from rampart.sim.osmosis.simulator import Schedule
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS, OsmosisFaults
 from rampart.sim.osmosis.world import World
