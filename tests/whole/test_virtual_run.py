@@ -20,7 +20,7 @@ from rampart.cli.main import main
 from rampart.sim.campaign.job import Job, run_job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.virtual_run import LEAD_S
-from rampart.testing import HEEDS_SIGNALS, RealRun, free_port
+from rampart.testing import HEEDS_SIGNALS, RealRun
 from tests import ROOT
 from tests.actors.recording.samples import pose
 from tests.whole.missions import write_mission
@@ -281,31 +281,3 @@ def test_a_mission_in_virtual_time_survives_the_gateway(tmp_path, capsys):
     assert all(fault["effective"] for fault in result["faults"])
 
 
-@pytest.mark.slow
-@pytest.mark.processes
-@pytest.mark.alone
-@pytest.mark.timeout(500)
-def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path):
-    where = f"tcp/127.0.0.1:{free_port()}"
-    text = SYSTEM.read_text(encoding="utf-8")
-    for old, new in (
-            ('interfaces = ["osmosis-ros2"]',
-             f'interfaces = ["{SYSTEM.with_suffix("")}"], connect = ["{where}"]'),
-            ("upper_laser = true", f'upper_laser = true, connect = ["{where}"]'),
-            ('name = "ros_router"\n',
-             f'name = "ros_router"\nparameters = {{ listen = "{where}" }}\n')):
-        assert text.count(old) == 1
-        text = text.replace(old, new)
-    (tmp_path / "ros.toml").write_text(text)
-    victims = ("gateway", "ros_router", "osmosis_control", "gateway", "localization", "hmi",
-               "ros_router", "safety_pilot", "ftm_manager")
-    with RealRun(tmp_path, tmp_path / "ros.toml", "--mission",
-                 str(write_mission(tmp_path, "ROW"))) as run:
-        run.wait_for("goal 1/")
-        for number, victim in enumerate(victims, 1):
-            run.sleep_until(3.0 * number)
-            run.kill(victim)
-        code, result = run.result(400)
-    assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
-    assert code == 0
-    assert {"gateway": 2, "ros_router": 2}.items() <= result["restarts"].items()

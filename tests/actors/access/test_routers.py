@@ -13,15 +13,13 @@ import zenoh
 
 from rampart.actors.access import key_folder
 from rampart.actors.access.certificates import new_authority, new_certificate, public_part
-from rampart.actors.access.register import read_register
 from rampart.actors.access.rights import rights_of_all
-from rampart.actors.access.rules import Host, config_of, rules_of
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.topics import INJECT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
-from rampart.actors.supervision.root import reserve_ports
+from rampart.testing import free_port
 from tests.actors.access.keyed import (
     Keyed,
     covered,
@@ -31,6 +29,7 @@ from tests.actors.access.keyed import (
     opened,
     wait_for,
 )
+from tests.two_hosts import two_hosts
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
@@ -244,57 +243,21 @@ async def test_a_refused_client_reports_its_certificate(keyed, monkeypatch):
         await bus.open()
 
 
-GROUND = frozenset({"hmi", "teleoperation", "DM5"})
-HOSTS = [Host("", nodes=frozenset(LAYOUT.members) - GROUND),
-         Host("ground", ("router_a_ground",), GROUND)]
-
-
-class Hosts:
-    """A router on each of two hosts, linked, and clients of either."""
-
-    def __init__(self, keys):
-        self.keys = keys
-        self.kept = reserve_ports(9_000)  # next to those of `keyed`
-        self.at = {name: f"tls/127.0.0.1:{kept.getsockname()[1]}"
-                   for name, kept in zip(("router_a", "router_a_ground"), self.kept, strict=True)}
-
-    def shown(self, name):
-        found = credentials_in(str(self.keys), name)
-        return Credentials(found.authority, found.own)
-
-    def router(self, host, dial=()):
-        rights = rights_of_all(LAYOUT)
-        rights["router_a_ground"] = rights["router_a"]
-        name = host.routers[0]
-        rules = rules_of(host, HOSTS, rights, read_register(self.keys))
-        return opened(session_config(
-            [self.at[name]], [self.at[one] for one in dial], self.shown(name), config_of(rules)))
-
-    def client(self, name):
-        at = self.at["router_a_ground" if name in GROUND else "router_a"]
-        return opened(session_config((), [at], self.shown(name)))
-
-
-@pytest.fixture
-def hosts(tmp_path):
-    keys = make_keys(tmp_path / "keys", LAYOUT)
-    key_folder.issue(keys, ["router_a_ground"], "router")
-    made = Hosts(keys)
-    yield made
-    for one in made.kept:
-        one.close()
-
-
-def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(hosts):
+def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(tmp_path, sockets):
     """Its router, with its key, tries every way; the robot's router lets nothing through."""
     forged = ("summit_xl/command", "supervisor/nodes", "supervisor/event",
               "recovery/RM1/command", "detection/DM4", "inject/order", "**")
-    with hosts.router(HOSTS[0]), hosts.client("router_a") as everybody:
+    file = tmp_path / "two.toml"
+    file.write_text(two_hosts({"robot": "127.0.0.1", "ground": "127.0.0.2"}))
+    layout = layout_of(file)
+    keys = make_keys(tmp_path / "keys", layout)
+    key_folder.issue(keys, ["router_a_ground"], "router")
+    with Keyed(sockets, keys, layout) as robot, robot.joined("router_b") as everybody:
         got: list[str] = []
         held = everybody.declare_subscriber("rampart/**", lambda s: got.append(str(s.key_expr)))
-        taken = session_config([hosts.at["router_a_ground"]], [hosts.at["router_a"]],
-                               hosts.shown("router_a_ground"))
-        with opened(taken) as ground:
+        taken = credentials_in(str(keys), "router_a_ground")
+        at = f"tls/127.0.0.1:{free_port()}"
+        with opened(session_config([at], [robot.at], taken)) as ground:
             def arrived():
                 for key in forged:
                     ground.put(f"rampart/{key}", "forged")
@@ -305,7 +268,8 @@ def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(hosts):
             arrived()
             answers = [r for r in everybody.get("rampart/summit_xl/command", timeout=0.5)
                        if r.ok is not None]
-        # inject/order is the page's to say, and the page is there
-        assert set(got) == {"rampart/detection/DM5", "rampart/inject/order"}
+        # Events are its supervisor's to say, too, and orders the page's, which is there.
+        assert set(got) == {"rampart/detection/DM5", "rampart/inject/order",
+                            "rampart/supervisor/event"}
         assert answers == []
         held.undeclare()

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import ctypes
 import os
-import re
 import select
 import signal
 import subprocess
@@ -37,7 +36,6 @@ from rampart.actors.system.layout import Layout
 from rampart.cli.operate import kill_node
 from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
-from tests import ROOT
 from tests.stub_actors import IdleDetection, IdlePose, launched, stub_plan, write_stub_system
 
 pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
@@ -469,78 +467,3 @@ async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path):
             assert victim != "DM2" or witness.pid("DM2") in there
         titles = [e.reason for e in witness.errors[start:] if e.context == "started with"]
         assert titles == 3 * ["changed"]
-
-
-# -- start and end ---------------------------------------------------------------------------------
-
-
-@asynccontextmanager
-async def started(tmp_path: Path, after_s: float | None = None
-                  ) -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
-    """Start a run of the stub system by its root; yield that and the base port.
-
-    Args:
-        tmp_path: Folder of its files.
-        after_s: When to yield; by default when all its processes are there.
-    """
-    plan = stub_plan(write_stub_system(tmp_path))
-    port = plan.base_port
-    with subprocess.Popen(
-            [sys.executable, "-P", str(ROOT / "launch.py"), "--system", plan.system_file,
-             "--no-hmi", "--port", str(port), "--report", str(tmp_path / "report"), "--json"],
-            env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, start_new_session=True) as root:
-        try:
-            if after_s is None:
-                await eventually(lambda: len(find_processes(port)) >= 26, 20)
-            else:
-                await asyncio.sleep(after_s)
-            yield root, port
-        finally:
-            root.kill()
-
-
-@pytest.mark.parametrize("stopped", [("supervisor", "DM1", "DM2", "RM1"), None])
-async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped):
-    async with started(tmp_path) as (root, port):
-        await asyncio.sleep(0.5)
-        folder = next(run.folder for run in find_runs() if run.base_port == port)
-        os.kill(process(port, "DM6"), signal.SIGUSR2)
-        for one in find_processes(port):
-            if stopped is None or set(one.names) & set(stopped):
-                os.kill(one.pid, signal.SIGSTOP)
-        root.kill()
-        await eventually(
-            lambda: find_processes(port) == [] and not Path(folder).exists()
-            and f"rampart.{port}." not in Path("/proc/net/unix").read_text()
-            and not list(Path("/dev/shm").glob(f"rampart-{port}-*"))
-            and not list(Path("/tmp").glob(f"*rampart*{port}*")), 2.0)
-    assert not [run for run in find_runs() if run.base_port == port]
-
-
-async def test_a_stopped_watching_process_is_continued_and_without_it_the_verdict_is_not_known(
-        tmp_path):
-    async with started(tmp_path) as (root, port):
-        pid = process(port, "run")
-        os.kill(pid, signal.SIGSTOP)
-        await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)
-        os.kill(pid, signal.SIGKILL)
-        out, err = await asyncio.to_thread(root.communicate, timeout=10)
-    assert root.returncode == 4
-    result = msgspec.json.decode(out.splitlines()[-1])
-    assert result["safety"] == "not known"
-    assert any("was killed" in reason for reason in result["reasons"])
-    assert "was killed by SIGKILL" in err
-    assert find_processes(port) == []
-
-
-@pytest.mark.parametrize("at_s", [0.05, 0.8])
-async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
-    async with started(tmp_path, at_s) as (root, port):
-        root.send_signal(signal.SIGINT)
-        _, err = await asyncio.to_thread(root.communicate, timeout=20)
-    assert root.returncode in {1, 4, -signal.SIGINT}  # the last before anything is loaded
-    # Python's own words, before the first line of ours has let ctrl-C end the process at once.
-    before = err.startswith("Fatal Python error") or not re.search(r"/(actors|cli|sim)/", err)
-    assert before or "Traceback" not in err
-    assert find_processes(port) == []

@@ -5,23 +5,28 @@ from __future__ import annotations
 import asyncio
 import io
 import os
+import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 
 from benchmarks.own_root import new_root
+from rampart.actors.bus.run_info import find_runs
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import load_system
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.root import needed_of
 from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
-from rampart.testing import free_base_port, turns
+from rampart.testing import RealRun, free_base_port, turns
 from tests import ROOT
 from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
 
@@ -192,3 +197,65 @@ def test_a_router_keeps_nothing_of_what_was_large(as_router, least, most):
     done = subprocess.run([sys.executable, "-c", KEPT_MB.format(as_router=as_router)],
                           capture_output=True, text=True, check=True, timeout=60)
     assert least < float(done.stdout) < most
+
+
+# -- start and end ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """A run of the stub system, not yet begun."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setattr(RealRun, "command", (sys.executable, "-P", str(ROOT / "launch.py")))
+    return RealRun(tmp_path, write_stub_system(tmp_path))
+
+
+def all_are_there(run: RealRun) -> bool:
+    return len(find_processes(run.port)) >= 26
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("stopped", [("supervisor", "DM1", "DM2", "RM1"), None])
+def test_a_killed_root_leaves_nothing_within_two_seconds(stub, stopped):
+    with stub as run:
+        run.wait_until(lambda: all_are_there(run), 20, "no processes")
+        folder = Path(run.info.folder)
+        run.kill("DM6", signal.SIGUSR2)
+        for one in find_processes(run.port):
+            if one.pid != run.process.pid and (stopped is None or set(one.names) & set(stopped)):
+                os.kill(one.pid, signal.SIGSTOP)
+        run.process.kill()
+        run.process.wait()
+        run.wait_until(
+            lambda: find_processes(run.port) == [] and not folder.exists()
+            and f"rampart.{run.port}." not in Path("/proc/net/unix").read_text()
+            and not list(Path("/dev/shm").glob(f"rampart-{run.port}-*"))
+            and not list(Path("/tmp").glob(f"*rampart*{run.port}*")), 2.0, "something is left")
+    assert not [one for one in find_runs() if one.base_port == run.port]
+
+
+@pytest.mark.processes
+def test_a_stopped_watching_process_is_continued_and_without_it_the_verdict_is_not_known(stub):
+    with stub as run:
+        run.wait_until(lambda: all_are_there(run), 20, "no processes")
+        pid = run.kill("run", signal.SIGSTOP)
+        run.wait_until(lambda: process_state(pid) != "T", 1.0, "it is not continued")
+        os.kill(pid, signal.SIGKILL)
+        code, result = run.result(10)
+    assert (code, result["safety"]) == (4, "not known")
+    assert any("was killed" in reason for reason in result["reasons"])
+    assert "was killed by SIGKILL" in run.story
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("at_s", [0.05, 0.8])
+def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(stub, at_s):
+    with stub as run:
+        time.sleep(at_s)
+        run.process.send_signal(signal.SIGINT)
+        run.process.wait(20)
+    assert run.process.returncode in {1, 4, -signal.SIGINT}  # the last before anything is loaded
+    # Python's own words, before the first line of ours has let ctrl-C end the process at once.
+    before = run.story.startswith("Fatal Python error") or not re.search(
+        r"/(actors|cli|sim)/", run.story)
+    assert before or "Traceback" not in run.story
