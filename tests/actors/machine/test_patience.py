@@ -123,28 +123,18 @@ def test_one_that_is_always_late_is_not_always_excused():
     assert 0 < excused < 50
 
 
-def test_this_process_is_as_psutil_sees_it():
+def test_a_process_is_as_psutil_sees_it_whatever_its_name_and_left_out_when_it_has_ended(tmp_path):
     count, other = read_count(os.getpid()), psutil.Process()
-    assert count is not None
     assert count.memory_bytes == pytest.approx(other.memory_info().rss, rel=0.2)
     assert count.cpu_s == pytest.approx(sum(other.cpu_times()[:2]), abs=1.0)
-
-
-def test_a_name_with_parentheses_and_spaces_does_not_shift_the_fields(tmp_path):
     program = tmp_path / "a) S (b"
     program.symlink_to("/bin/sleep")
     with subprocess.Popen([program, "60"]) as process:
-        count = read_count(process.pid)
+        started_s = read_count(process.pid).started_s
         process.kill()
-    assert count is not None
-    assert 0 <= time.clock_gettime(time.CLOCK_BOOTTIME) - count.started_s < 60
-
-
-def test_a_process_that_has_ended_is_left_out():
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    assert read_count(ended.pid) is None
-    assert UsageMeter().look([ended.pid, 0, -5]) == {}
+    assert 0 <= time.clock_gettime(time.CLOCK_BOOTTIME) - started_s < 60
+    assert read_count(process.pid) is None
+    assert UsageMeter().look([process.pid, 0, -5]) == {}
 
 
 def test_the_share_is_over_the_whole_life_at_first_and_then_since_the_look_before():
