@@ -161,9 +161,15 @@ def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_after
         (("FTM14",), ("RM2",)), ((), ())]
 
 
-def test_a_module_that_is_not_heard_is_restarted(near):
-    record = run_virtually(job("drop:detection/DM2@10+8", system="osmosis", options=near)).record
-    assert (record.mission, record.safety, record.restarts) == ("success", "safe", {"DM2": 1})
+@pytest.mark.parametrize(("faults", "restarts"), [
+    (["drop:detection/DM2@10+8"], {"DM2": 1}), (["stop:all@10+30"], {}),  # everybody pauses
+    (["stop:all@10+5", "kill:localization@12", "wedge:graph_planner@15.1"],
+     {"localization": 1, "graph_planner": 1})])
+def test_only_what_is_not_heard_or_dies_is_restarted_pauses_of_everybody_or_not(
+        near, faults, restarts):
+    record = run_virtually(job(*faults, system="osmosis", options=near)).record
+    assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
+    assert not [d for d in record.decisions if "RM1" in d.recoveries]
 
 
 @pytest.mark.slow
@@ -179,19 +185,6 @@ def test_killed_detection_modules_know_the_state_again_before_their_silence_coun
     kills = [f"kill:DM{n}@{1.5 * n}" for n in range(1, 15)]
     result = run_job(job(*kills, system="osmosis", options=near))
     assert (result.success, result.safe, decisions(result)) == (True, True, [])
-
-
-def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(near):
-    record = run_virtually(job("stop:all@10+30", system="osmosis", options=near)).record
-    assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
-    assert not [d for d in record.decisions if "RM1" in d.recoveries]
-
-
-def test_what_dies_during_a_pause_of_everybody_is_restarted_after_it(near):
-    record = run_virtually(job("stop:all@10+5", "kill:localization@12", "wedge:graph_planner@15.1",
-                               system="osmosis", options=near)).record
-    assert (record.mission, record.safety) == ("success", "safe")
-    assert record.restarts == {"localization": 1, "graph_planner": 1}
 
 
 def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(near):
