@@ -81,6 +81,8 @@ def test_top_tells_a_script_everything_once(run, capsys):
     processes = {row["name"]: row for row in data["processes"]}
     assert {"simulator", "safety_pilot", "supervisor", "launch.py"} <= processes.keys()
     assert processes["simulator"]["mb"] > 1
+    assert processes["simulator"].keys() >= {"state", "incarnation", "restarts", "cpu", "age_s"}
+    assert data["decisions"] == []
     assert processes["simulator"]["pid"] == run.pid("simulator")
     assert data["rates_hz"]["localization/pose"] > 5
     told = run.tool("top")  # into a pipe: one picture in plain text

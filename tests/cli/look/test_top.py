@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
@@ -17,7 +16,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.clock import Clock
-from rampart.cli.look.top import Frame, picture_json, screen
+from rampart.cli.look.top import Frame, screen
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import RunPicture, draw
 from rampart.systems import DEFAULT
@@ -130,13 +129,3 @@ def test_every_topic_is_either_read_or_counted():
     assert {t.key for t in read} >= {topics.POSE.key, ftm_topics.NODES.key}
     assert sorted(t.key for t in (*read, *counted)) == sorted(t.key for t in topics.ALL)
     assert isinstance(picture.lines, OsmosisLines)
-
-
-def test_the_same_can_be_had_as_data():
-    data = msgspec.json.decode(msgspec.json.encode(picture_json(frame(busy()))))
-    assert data["mission"]["step"] == 1
-    assert data["decisions"][0]["words"].startswith("RM3: FTM4")
-    assert data["processes"][0] == {
-        "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
-        "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
-        "late_s": 0.0, "host": "", "failing": False}
