@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
-
-import msgspec
 
 from rampart.actors.foreign.program import wrong_programs
 from rampart.cli import systems
@@ -19,41 +17,6 @@ from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
 
 _ROOT = "root"
-
-
-class Consequence(msgspec.Struct, frozen=True):
-    """The consequence of a detection, if no other module detects anything.
-
-    Attributes:
-        detection: the module.
-        title: the detected error.
-        within_s: latency of the detection, simulated seconds.
-        mechanisms: mechanisms that use the module.
-        active: those of them that are active.
-        needs: the gate of each other one.
-        decided: recoveries that the system's strategy chooses.
-        rule: rule of the strategy that applies.
-        escalation: for each recovery, those that follow as one after the other fails.
-    """
-
-    detection: str
-    title: str
-    within_s: float
-    mechanisms: tuple[str, ...]
-    active: tuple[str, ...]
-    needs: dict[str, str]
-    decided: tuple[str, ...]
-    rule: str
-    escalation: dict[str, tuple[str, ...]]
-
-
-class Explanation(msgspec.Struct, frozen=True):
-    """The description of a system."""
-
-    system: str
-    title: str
-    strategy: str
-    consequences: tuple[Consequence, ...]
 
 
 def add(verbs: Any) -> None:
@@ -89,20 +52,23 @@ def run(options: argparse.Namespace) -> int:
         else:
             _show_pairs(spec, table)
         return 0
-    found = explain(spec)
+    found = list(_consequences(spec))
     if options.json:
-        print_json(found)
+        print_json({"system": spec.name, "title": spec.title, "strategy": spec.strategy,
+                    "consequences": found})
     else:
-        _show(found)
+        _show(spec, found)
     return 0
 
 
-def explain(spec: SystemSpec) -> Explanation:
-    """Return the description of a system."""
-    return Explanation(spec.name, spec.title, spec.strategy, tuple(_consequences(spec)))
+def _consequences(spec: SystemSpec) -> Iterator[dict[str, Any]]:
+    """Yield the consequence of each detection, if no other module detects anything.
 
-
-def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
+    `within_s` is its latency in simulated seconds. `mechanisms` use the module; `active` are those
+    of them that are active, and `needs` has the gate of each other one. `decided` are the
+    recoveries that the system's strategy chooses, and `escalation` has for each of them those that
+    follow as one after the other fails.
+    """
     if not spec.mechanisms:
         return
     mechanisms, tree, order = spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order()
@@ -119,8 +85,10 @@ def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
                 recovery, sakes or decision.mechanisms, mechanisms.contracts, arrangement)[1:])
         needs = {m.name: m.detect for m in spec.mechanisms
                  if m.name in listening and m.name not in active}
-        yield Consequence(name, detection.title, spec.latency_s(detection), listening, active,
-                          needs, decision.recoveries, str(decision.rule), escalation)
+        yield {"detection": name, "title": detection.title,
+               "within_s": spec.latency_s(detection), "mechanisms": listening, "active": active,
+               "needs": needs, "decided": decision.recoveries, "rule": str(decision.rule),
+               "escalation": escalation}
 
 
 def _show_pairs(spec: SystemSpec, table: Sequence[Pair]) -> None:
@@ -149,22 +117,22 @@ def _joined(recoveries: Sequence[str]) -> str:
     return " + ".join(recoveries) or "-"
 
 
-def _show(found: Explanation) -> None:
-    say(f"{found.title} ({found.system}), strategy {found.strategy}")
+def _show(spec: SystemSpec, found: Sequence[Mapping[str, Any]]) -> None:
+    say(f"{spec.title} ({spec.name}), strategy {spec.strategy}")
     say()
     say("Consequence of each detection, if no other module detects anything")
-    for each in found.consequences:
-        say(f"  {each.detection} ({each.title}, within {each.within_s:g} s) -> "
-            f"{', '.join(each.mechanisms)} -> {_decided(each)}")
+    for each in found:
+        say(f"  {each['detection']} ({each['title']}, within {each['within_s']:g} s) -> "
+            f"{', '.join(each['mechanisms'])} -> {_decided(each)}")
 
 
-def _decided(found: Consequence) -> str:
-    if not found.active:
+def _decided(found: Mapping[str, Any]) -> str:
+    if not found["active"]:
         return "none: " + "; ".join(
-            f"{name} needs {gate}" for name, gate in found.needs.items())
+            f"{name} needs {gate}" for name, gate in found["needs"].items())
     return ", ".join(
-        f"{name}; if it fails: {' > '.join(after)}" if (after := found.escalation[name])
-        else f"{name}, the last resort" for name in found.decided) or "no recovery"
+        f"{name}; if it fails: {' > '.join(after)}" if (after := found["escalation"][name])
+        else f"{name}, the last resort" for name in found["decided"]) or "no recovery"
 
 
 def check(options: argparse.Namespace) -> int:
