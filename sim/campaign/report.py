@@ -199,17 +199,11 @@ def headline(runs: Sequence[Run]) -> str:
     if not faulty:
         return (f"{count(len(runs), 'run')} without a fault: {_many(runs, 'unsafe')}, "
                 f"{_many(runs, 'complete')}.")
-    odd = sum(run.result.counts and not run.result.effective for run in faulty)
     parts: list[str] = []
     for ftm, name in ((True, "With fault tolerance"), (False, "Without fault tolerance")):
         counted = [run for run in faulty if run.job.ftm == ftm and run.result.counts]
         if counted:
-            more = "" if parts or odd else "with an effective fault "
-            parts.append(f"{name} {_many(counted, 'unsafe', more)}; "
-                         f"{_many(counted, 'complete')}.")
-    if odd:
-        parts.append(f"In {odd:,} of these the fault had no effect; unsafe and failed runs "
-                     "count all the same.")
+            parts.append(f"{name} {_many(counted, 'unsafe')}; {_many(counted, 'complete')}.")
     if lost := sum(not run.result.counts for run in faulty):
         parts.append(f"In {count(lost, 'run')}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
@@ -220,15 +214,15 @@ def _breakable(text: str) -> Markup:
     return Markup("<wbr>").join(re.split(r"(?<=[:/_])", text))
 
 
-def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
+def _many(runs: Sequence[Run], what: str) -> str:
     """Return the number of unsafe runs with its interval, or of completed missions."""
     if what == "complete":
         return f"{sum(run.result.success for run in runs):,} completed the mission"
     found = rate(sum(not run.result.safe for run in runs), len(runs))
     number = f"{found.count:,}" if found.count else "none"
     sure = interval(found) if found.count else f"at most {percent(found.high)} %"
-    return (f"{number} of {count(found.of, 'run')} {more}"
-            f"{'was' if found.count == 1 else 'were'} unsafe (95 % interval: {sure})")
+    return (f"{number} of {count(found.of, 'run')} {'was' if found.count == 1 else 'were'} unsafe "
+            f"(95 % interval: {sure})")
 
 
 # -- tables ------------------------------------------------------------------------------------
@@ -317,23 +311,17 @@ def _margin(value: float | None, trial: type[Trial]) -> str:
 
 
 def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
-    """Return the worst runs, worst first, each with another fault.
+    """Return the worst runs, each with another fault, those with fault tolerance first.
 
-    Runs without fault tolerance are expected to be unsafe. So they get at most half of the places
-    that others could fill, and unsafe runs with fault tolerance come first. Runs without any effect
-    are left out.
+    Runs without any effect are left out.
     """
-    ranked = sorted(runs, key=_rank, reverse=True)
     different: dict[tuple[bool, tuple[str, ...]], Run] = {}
-    for run in ranked:
+    for run in sorted(runs, key=lambda run: (run.job.ftm, badness(run)), reverse=True):
         bad = not (run.result.safe and run.result.success)
         if bad or (run.job.faults and run.result.effective):
             faults = tuple(sorted(fault.fault for fault in run.job.faults))
             different.setdefault((run.job.ftm, faults), run)
-    protected = [run for run in different.values() if run.job.ftm]
-    bare = [run for run in different.values() if not run.job.ftm]
-    bare = bare[:max(most // 2, most - len(protected))]
-    return sorted([*protected[:most - len(bare)], *bare], key=_rank, reverse=True)
+    return list(different.values())[:most]
 
 
 def moments(result: RunResult) -> list[tuple[float, str]]:
@@ -348,7 +336,3 @@ def moments(result: RunResult) -> list[tuple[float, str]]:
     return sorted([*marks, *(
         (d.t_s, f"{', '.join(d.active) or 'nothing'}: {', '.join(d.recoveries) or 'no recovery'}")
         for d in result.decisions[:DECISIONS])])
-
-
-def _rank(run: Run) -> tuple[bool, tuple[bool, bool, float]]:
-    return (run.job.ftm and not run.result.safe, badness(run))

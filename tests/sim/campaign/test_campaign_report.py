@@ -60,16 +60,14 @@ def text_of(page: str, between: str = "") -> str:
 # -- the page ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("ended", "complete"), [
-    ({"safe": False, "severity": 1.0}, 2), ({"success": False}, 1), ({}, 1)])
-def test_the_headline_counts_a_run_that_ends_badly_though_its_fault_had_no_effect(
-        ended, complete):
-    told = headline([run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0, **ended)])
-    of = "2 runs" if ended else "1 run"
-    assert f"{'1' if ended.get('safe') is False else 'none'} of {of} " in told
-    assert f"{complete} completed the mission" in told
-    assert ("In 1 of these the fault had no effect" in told) == bool(ended)
-    assert ("In 1 run more the fault had no effect." in told) == (not ended)
+@pytest.mark.parametrize(("ended", "told"), [
+    ({"safe": False, "severity": 1.0}, "1 of 2 runs was unsafe (95 % interval: 9.5 to 90.5 %); 2 "),
+    ({"success": False}, "none of 2 runs were unsafe (95 % interval: at most 65.8 %); 1 "),
+    ({}, "none of 1 run were unsafe (95 % interval: at most 79.3 %); 1 completed the mission. "
+         "In 1 run more the fault had no effect.")])
+def test_the_headline_counts_a_run_that_ends_badly_though_its_fault_had_no_effect(ended, told):
+    line = headline([run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0, **ended)])
+    assert f"With fault tolerance {told}" in line.replace("\N{NO-BREAK SPACE}", " ")
 
 
 def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsafe():
@@ -160,8 +158,7 @@ def test_where_a_verdict_differs_the_story_of_the_worst_run_is_told():
 def test_unprotected_runs_do_not_crowd_out_those_with_fault_tolerance():
     bare = [run(f"drop:t/{n}", seed=n, ftm=False, safe=False) for n in range(9)]
     mild = [run(f"drop:t/{n}", seed=n, success=False) for n in range(2)]
-    assert [r.job.ftm for r in worth_showing([*bare, *mild])] == [False] * 4 + [True] * 2
-    assert [r.job.ftm for r in worth_showing(bare)] == [False] * 6
+    assert [r.job.ftm for r in worth_showing([*bare, *mild])] == [True] * 2 + [False] * 4
     unsafe = run("gps-bias", safe=False, prohibited_m=0.9)
     assert worth_showing([*bare, *mild, unsafe])[0] is unsafe
 
