@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 
 import pytest
 
 from rampart.actors.web.visitors import (
     MOST,
+    SECRET_BYTES,
     Register,
     Role,
+    SecretError,
     Visitor,
     VisitorError,
     digest,
     issue,
     lists_visitors,
     parse,
+    read_secret,
     read_visitors,
     revoke,
 )
 from rampart.cli.main import main
+from tests.other_user import NOBODY, needs_root
 
 ANNA = f"anna drive {'a' * 64}"
 
@@ -135,3 +141,59 @@ def test_what_a_verb_cannot_do_is_one_line_and_code_2(
     (tmp_path / "open").write_text("")
     (tmp_path / "open").chmod(0o644)
     assert refused("tokens", *arguments).startswith(f"rampart: {words}")
+
+
+# -- The token of the operator's page: where it may come from, and where it must not turn up --
+
+
+TOKEN = "secret-of-the-hangar-7"
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    made = tmp_path / "token"
+    made.touch(0o600)
+    made.write_text(f"{TOKEN}\n")
+    return made
+
+
+def not_taken(file: Path) -> str:
+    with pytest.raises(SecretError) as error:
+        read_secret(file)
+    assert TOKEN not in str(error.value)
+    return str(error.value)
+
+
+def test_a_file_that_only_its_owner_can_read_is_taken(file, tmp_path):
+    assert read_secret(file) == TOKEN
+    link = tmp_path / "link"
+    link.symlink_to(file)
+    assert read_secret(link) == TOKEN
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o602, 0o601])
+def test_a_file_that_others_can_get_at_is_refused(file, mode):
+    file.chmod(mode)
+    assert not_taken(file) == f"mode {mode:04o}: others can access it; chmod 600"
+
+
+@needs_root
+def test_a_file_of_somebody_else_is_refused(file):
+    os.chown(file, NOBODY, NOBODY)
+    assert not_taken(file) == f"belongs to user {NOBODY}; expected your file"
+
+
+@pytest.mark.parametrize("content", [
+    b"", b"\n \n", f"{TOKEN}\n{TOKEN}".encode(), b"x" * (SECRET_BYTES + 1), b"\xff\xfe" * 10,
+    "ключ-от-ангара-семь".encode()])
+def test_what_is_not_one_plain_line_is_refused(file, content):
+    file.write_bytes(content)
+    assert not_taken(file).startswith("expected one line")
+
+
+def test_what_is_no_file_is_refused_and_a_fifo_waits_for_nobody(tmp_path):
+    assert not_taken(tmp_path) == "expected an ordinary file"
+    os.mkfifo(tmp_path / "fifo", 0o600)
+    assert not_taken(tmp_path / "fifo") == "expected an ordinary file"
+    assert not_taken(tmp_path / "nothing") == "cannot be read (No such file or directory)"
+    assert not_taken(Path("a\0b")).startswith("cannot be read")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.messages import Twist
 from rampart.sim.osmosis.trial import mission_trial as trial
-from rampart.sim.osmosis.trial.mission_trial import WATCH_S, RunEnd
+from rampart.sim.osmosis.trial.mission_trial import WATCH_S, WORLD_LATE_S, RunEnd
+from rampart.sim.runs.process_run import _RELINK_S, excused_s
 
 STANDS = m.Twist(0.0, 0.0)
 GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
@@ -123,3 +127,22 @@ def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
     end.control(going(20.0), 35.0)
     assert end.ended(60.0) is None
     assert end.ended(76.0) == "no progress for 40 s"
+
+
+# -- What a launcher that was stopped excuses, without a process; the rest is in tests/whole --
+
+
+@pytest.mark.parametrize("late_s", [-0.01, 0.0, 0.4])
+def test_a_loaded_machine_excuses_nothing(late_s):
+    assert excused_s(late_s) == 0.0
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
+def test_a_launcher_that_was_stopped_dials_its_partners_again_before_the_world_counts_as_gone(rate):
+    end = RunEnd(patience_s=60.0, waits=True)
+    end.truth(Twist(0.0, 0.0), 10.0)
+    awake_s = 10.0 + 7.0 * rate  # stopped for seven seconds of wall time
+    end.excuse(excused_s(7.0) * rate)
+    relinked_s = awake_s + _RELINK_S * rate
+    assert end.world_gone(relinked_s) == ""
+    assert "the world is gone" in end.world_gone(relinked_s + WORLD_LATE_S + 0.1)
