@@ -46,7 +46,24 @@ class Counter(msgspec.Struct, frozen=True):
     label: str = "xxxx"
 
 
-FORM = StateFormat(Counter)
+FORM = StateFormat(
+    Counter, version=3, objection=lambda state: "it is negative" if state.count < 0 else "")
+
+
+class Desk:
+    """A keeper, its clock, and what it has reported."""
+
+    def __init__(self, store: CheckpointStore, *, expected: bool = False) -> None:
+        self.now_s = 0.0
+        self.told: list[str] = []
+        self.keeper = Keeper(store, self.told.append, lambda: self.now_s, expected=expected)
+
+    def count(self) -> int | None:
+        found = self.keeper.kept(FORM)
+        return found and found.count
+
+    def keep(self, count: int) -> None:
+        self.keeper.keep(FORM, Counter(count))
 
 
 @pytest.fixture
@@ -76,7 +93,7 @@ def counted(folder: Path) -> Path:
     """Keep six states, and return the file of the newest."""
     store = FileCheckpoints(folder, "node", "run", 1, syncs=False)
     for number in range(1, 7):
-        store.save(1, 0, FORM.encode(Counter(number)))
+        store.save(3, 0, FORM.encode(Counter(number)))
     store.close()
     return newest(folder)
 
@@ -86,20 +103,22 @@ def newest(folder: Path) -> Path:
     return files[max(files)]
 
 
-def restarted(folder: Path, incarnation: int = 2) -> tuple[Counter | None, list[str]]:
+def restarted(folder: Path, incarnation: int = 2) -> tuple[int | None, list[str]]:
     """Return what the next process of the node finds and reports, having kept a state of its own.
 
     Whatever lies there, the one after it finds that state.
     """
-    told: list[str] = []
-    store = FileCheckpoints(folder, "node", "run", incarnation, syncs=False)
-    keeper = Keeper(store, told.append, lambda: 0.0, expected=True)
-    found = keeper.kept(FORM)
-    keeper.keep(FORM, Counter(99))
-    keeper.close()
-    after = read(folder, "node", "run").records
-    assert FORM.decode(1, after[0].state) == Counter(99)
-    return found, told
+    desk = Desk(FileCheckpoints(folder, "node", "run", incarnation, syncs=False), expected=True)
+    found = desk.count()
+    desk.keep(99)
+    desk.keeper.close()
+    assert newest_state(folder) == 99
+    return found, desk.told
+
+
+def newest_state(folder: Path) -> int:
+    record, *_ = read(folder, "node", "run").records
+    return FORM.decode(record.version, record.state).count
 
 
 # -- what is found again -------------------------------------------------------------------------
@@ -158,23 +177,23 @@ def test_the_generations_of_former_processes_are_still_there_when_the_newest_is_
     for incarnation in range(1, 8):
         store = FileCheckpoints(folder, "node", "run", incarnation)
         store.load()
-        store.save(1, 0, FORM.encode(Counter(incarnation)))
+        store.save(3, 0, FORM.encode(Counter(incarnation)))
         wait_until(lambda: len(files_of(folder, "node")) <= GENERATIONS, what="older files stay")
         store.close()
     file = newest(folder)
     file.write_bytes(file.read_bytes()[:-1])
     found, told = restarted(folder, 8)
-    assert found == Counter(6)
+    assert found == 6
     assert len(told) == 1
 
 
 def test_a_run_starts_afresh_where_another_ended_and_takes_what_another_host_kept(folder):
     """Whatever incarnations the other run had."""
-    put(folder, "node", "ended", Record(5, 40, 1, 0, FORM.encode(Counter(40))))
+    put(folder, "node", "ended", Record(5, 40, 3, 0, FORM.encode(Counter(40))))
     found, told = restarted(folder, 1)
     assert (found, len(told)) == (None, 1)
-    put(folder, "node", "run", Record(1_000_001, 5, 1, 0, FORM.encode(Counter(50))))
-    assert restarted(folder, 1_000_002) == (Counter(50), [])
+    put(folder, "node", "run", Record(1_000_001, 5, 3, 0, FORM.encode(Counter(50))))
+    assert restarted(folder, 1_000_002) == (50, [])
 
 
 def test_a_folder_that_was_removed_is_made_again(store, folder):
@@ -210,11 +229,10 @@ def test_a_file_that_is_cut_or_has_a_wrong_byte_anywhere_gives_way_to_the_state_
                  for value in (whole[at] ^ 1, whole[at] ^ 0x80, 255 - whole[at]))
         for rest in (b"", *wrong):
             file.write_bytes(whole[:at] + rest)
-            records, problems = read(tmp_path, "node", "run")
-            assert FORM.decode(1, records[0].state) == Counter(5), (at, rest)
-            assert len(problems) == 1, (at, rest)
+            assert newest_state(tmp_path) == 5, (at, rest)
+            assert len(read(tmp_path, "node", "run").problems) == 1, (at, rest)
     found, told = restarted(tmp_path)
-    assert (found, len(told)) == (Counter(5), 1)
+    assert (found, len(told)) == (5, 1)
 
 
 def bind(file: Path) -> None:
@@ -224,7 +242,7 @@ def bind(file: Path) -> None:
 
 def of_another(run: str, node: str) -> Callable[[Path], object]:
     def make(file: Path) -> None:
-        put(file.parent, node, run, Record(1, 1, 1, 0, FORM.encode(Counter(3))))
+        put(file.parent, node, run, Record(1, 1, 3, 0, FORM.encode(Counter(3))))
         if node != "node":
             (file.parent / f"{node}.1.1").rename(file)
 
@@ -256,16 +274,13 @@ def test_something_else_in_the_place_of_a_file_is_one_line_and_the_node_runs(fol
 def test_something_in_the_place_of_the_next_file_is_reported_and_gone_round(folder, make):
     counted(folder)
     make(folder / "node.2.7")
-    told, now_s = list[str](), [0.0]
-    keeper = Keeper(FileCheckpoints(folder, "node", "run", 2, syncs=False), told.append,
-                    lambda: now_s[0], expected=True)
-    assert keeper.kept(FORM) == Counter(6)
-    for moment in (0.0, 1.5, 3.0):
-        now_s[0] = moment
-        keeper.keep(FORM, Counter(99))
-    keeper.close()
-    assert told
-    assert FORM.decode(1, read(folder, "node", "run").records[0].state) == Counter(99)
+    desk = Desk(FileCheckpoints(folder, "node", "run", 2, syncs=False), expected=True)
+    assert desk.count() == 6
+    for desk.now_s in (0.0, 1.5, 3.0):
+        desk.keep(99)
+    desk.keeper.close()
+    assert desk.told
+    assert newest_state(folder) == 99
 
 
 def test_a_full_disk_is_one_line_and_the_states_before_it_stay(store, folder):
@@ -313,26 +328,6 @@ def test_a_process_that_is_killed_at_any_time_leaves_its_last_acknowledged_state
 
 
 # -- the format of states, and the keeper that stands between a store and its node
-
-
-COUNTER = StateFormat(
-    Counter, version=3, objection=lambda state: "it is negative" if state.count < 0 else "")
-
-
-class Desk:
-    """A keeper, its clock, and what it has reported."""
-
-    def __init__(self, store: CheckpointStore, *, expected: bool = False) -> None:
-        self.now_s = 0.0
-        self.told: list[str] = []
-        self.keeper = Keeper(store, self.told.append, lambda: self.now_s, expected=expected)
-
-    def count(self) -> int | None:
-        found = self.keeper.kept(COUNTER)
-        return found and found.count
-
-    def keep(self, count: int) -> None:
-        self.keeper.keep(COUNTER, Counter(count))
 
 
 class Broken(CheckpointStore):
@@ -394,7 +389,7 @@ def test_a_state_that_is_too_large_is_refused_with_one_line_and_the_one_before_s
     desk.keep(1)
     for tick in range(20):
         desk.now_s = float(tick)
-        desk.keeper.keep(COUNTER, Counter(2, 0, "x" * LARGEST_STATE_BYTES))
+        desk.keeper.keep(FORM, Counter(2, 0, "x" * LARGEST_STATE_BYTES))
     assert len(desk.told) == 1
     assert str(LARGEST_STATE_BYTES) in desk.told[0]
     assert Desk(store).count() == 1
