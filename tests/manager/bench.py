@@ -47,6 +47,14 @@ def edited(**changes: Any) -> SystemSpec:
     return msgspec.structs.replace(spec, **changes)
 
 
+def closure(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Return all pairs that follow from these by transitivity, by brute force."""
+    closed = set(pairs)
+    while more := {(a, d) for a, b in closed for c, d in closed if b == c} - closed:
+        closed |= more
+    return closed
+
+
 class Bench:
     """An arbiter, a clock that moves when told, and everything the arbiter has put out."""
 

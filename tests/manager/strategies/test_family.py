@@ -21,16 +21,9 @@ from rampart.manager.strategies.mission_first import MissionFirst
 from rampart.manager.strategies.registry import STRATEGIES, UnknownStrategyError, decide
 from rampart.manager.strategies.safety_first import SafetyFirst
 from rampart.manager.strategies.simultaneous import Simultaneous
-from tests.manager.bench import paper
+from tests.manager.bench import closure, paper
 
 NOBODY = frozenset()
-
-
-def closure(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
-    closed = set(pairs)
-    while more := {(a, d) for a, b in closed for c, d in closed if b == c} - closed:
-        closed |= more
-    return closed
 
 
 class System(NamedTuple):
