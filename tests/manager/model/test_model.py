@@ -15,12 +15,7 @@ from rampart.manager.model.gates import (
     detection_gate,
     recovery_gate,
 )
-from rampart.manager.model.order import (
-    CycleError,
-    PartialOrder,
-    UnknownElementError,
-    find_cycle,
-)
+from rampart.manager.model.order import CycleError, PartialOrder, UnknownElementError, find_cycle
 from tests.manager.bench import closure, paper
 
 RM_ORDER = paper().build_order()

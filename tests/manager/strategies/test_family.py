@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
-from rampart.manager.model.order import (
-    CycleError,
-    PartialOrder,
-    Tree,
-    UnknownElementError,
-    refine,
-)
+from rampart.manager.model.order import CycleError, PartialOrder, Tree, UnknownElementError, refine
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.guarded_repair import GuardedRepair
 from rampart.manager.strategies.mission_first import MissionFirst
