@@ -106,7 +106,7 @@ class Bench:
         """Play a timeline, step by step, and compare what follows of each step.
 
         A step is `DM4 node` (reports activity of nodes), `-DM4`, `RM3 done` (with `41`: of that
-        decision), `wait 1.0` (`without DM1`: which is not heard), `reset RM1` or `refused RM1`.
+        decision), `wait 1.0` (`without DM1`: which is not heard), `reset RM1` or `refused RM1 why`.
         Behind it: `> +RM2 -RM3`, the commands of this step; `= RM2 (RM3)`, the orders then. What is
         known is checked by `latched:`, `active:`, `silent:`, `late:`; `rejected: RM3 words` looks
         for a reason of the last decision.
@@ -130,7 +130,9 @@ class Bench:
         if word == "wait":
             return self.wait(float(rest[0]), hearing=tuple(dm for dm in DMS if dm not in rest[2:]))
         if word in {"reset", "refused"}:
-            assert self.reset(rest[0]).granted == (word == "reset"), rest
+            answer = self.reset(rest[0])
+            assert answer.granted == (word == "reset"), rest
+            assert " ".join(rest[1:]) in answer.reason
         elif word == "rejected:":
             why = dict(self.decisions[-1].decision.rejected)[rest[0]]
             assert " ".join(rest[1:]) in why, why

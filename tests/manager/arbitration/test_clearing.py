@@ -29,38 +29,29 @@ def bench(**fields) -> Bench:
 STOPPED = "DM2 osmosis_control > +RM2; RM2 done; -DM2; wait 1.0"
 
 
-def test_by_operator_it_stays_until_it_is_reset():
-    run = bench(clears=Clears.BY_OPERATOR)
-    run.play("DM2 > +RM2; RM2 done; latched: RM2")
-    assert run.reset("RM2").reason == "the cause persists: FTM2 active"
-    run.play("-DM2; wait 20 = RM2; active: FTM2; latched: RM2")
-    run.play("reset RM2; wait 0.1 =; active:; latched:")
-    run.play("refused RM2")  # the same reset a second time finds nothing
+CLEARING = {
+    "by operator it stays until it is reset": ({"clears": Clears.BY_OPERATOR}, """
+        DM2 > +RM2; RM2 done; latched: RM2; refused RM2 the cause persists: FTM2 active
+        -DM2; wait 20 = RM2; active: FTM2; latched: RM2; reset RM2; wait 0.1 =; active:; latched:
+        refused RM2"""),
+    "by operator after the time without its error": (
+        {"clears": Clears.BY_OPERATOR, "clear_after_s": 5.0}, f"""
+        {STOPPED}; wait 3; refused RM2 FTM2 clears when its error has been gone for 5 s
+        DM2; -DM2; wait 4.5; refused RM2; wait 10; reset RM2; wait 0.1 ="""),
+    "by itself after the time without its error": ({"clear_after_s": 5.0}, f"""
+        {STOPPED}; wait 3 = RM2; latched:; refused RM2; wait 3 =; active:"""),
+    "never": ({"clears": Clears.NEVER}, f"""
+        {STOPPED}; wait 20; refused RM2 FTM2 never clears = RM2"""),
+    "not by the reset of a safer recovery that replaced its own": (
+        {"clears": Clears.BY_OPERATOR}, """
+        DM2 > +RM2; RM2 done; DM1; RM1 done; -DM2; -DM1; wait 1.0; latched: RM1 RM2
+        reset RM1; RM1 idle; wait 0.1 = RM2; active: FTM2; RM2 done; reset RM2; wait 0.1 ="""),
+}
 
 
-def test_it_clears_after_the_time_without_its_error():
-    run = bench(clears=Clears.BY_OPERATOR, clear_after_s=5.0)
-    run.play(f"{STOPPED}; wait 3; refused RM2")
-    assert run.reset("RM2").reason == "FTM2 clears when its error has been gone for 5 s"
-    run.play("DM2; -DM2; wait 4.5; refused RM2; wait 10; reset RM2; wait 0.1 =")
-
-
-def test_by_itself_it_clears_after_the_time_without_its_error():
-    run = bench(clear_after_s=5.0)
-    run.play(f"{STOPPED}; wait 3 = RM2; latched:; refused RM2; wait 3 =; active:")
-
-
-def test_never_is_not_reset():
-    run = bench(clears=Clears.NEVER)
-    run.play(f"{STOPPED}; wait 20; refused RM2 = RM2")
-    assert run.reset("RM2").reason == "FTM2 never clears; only a new run ends it"
-
-
-def test_a_mechanism_whose_recovery_a_safer_one_replaces_is_not_cleared_by_that_one_s_reset():
-    run = bench(clears=Clears.BY_OPERATOR)
-    run.play("DM2 > +RM2; RM2 done; DM1; RM1 done; -DM2; -DM1; wait 1.0; latched: RM1 RM2")
-    run.play("reset RM1; RM1 idle; wait 0.1 = RM2; active: FTM2")
-    run.play("RM2 done; reset RM2; wait 0.1 =")
+@pytest.mark.parametrize(("fields", "script"), CLEARING.values(), ids=CLEARING)
+def test_it_clears_as_specified(fields, script):
+    bench(**fields).play(script)
 
 
 def test_it_is_remembered_although_its_recovery_never_ran():
