@@ -1,7 +1,5 @@
 """The shipped system, and systems in virtual time whose actors know of a place and a mission."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Another user of this machine: code that runs as nobody, for which the tests must be root's."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

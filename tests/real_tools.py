@@ -3,8 +3,6 @@
 Tests that poll a run use them: a new interpreter for each look takes most of a processor.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 

@@ -1,7 +1,5 @@
 """A tank with a level, a pump and a valve: topics for tests of modules that know no robot."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Annotated
 

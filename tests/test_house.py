@@ -3,8 +3,6 @@
 Checked on the code itself, not on a drawing.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

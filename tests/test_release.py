@@ -1,7 +1,5 @@
 """The release command: what it changes, and what it refuses."""
 
-from __future__ import annotations
-
 import datetime
 import sys
 import tomllib

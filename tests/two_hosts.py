@@ -1,7 +1,5 @@
 """Systems on two machines: the robot's, and a ground station with a page and some modules."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 
 from tests import system_file

@@ -1,7 +1,5 @@
 """Tests in virtual time, each within a world of its own."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Awaitable, Callable

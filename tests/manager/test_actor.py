@@ -1,7 +1,5 @@
 """The FTM Manager among modules on one virtual bus; nothing here takes real time."""
 
-from __future__ import annotations
-
 import asyncio
 
 from rampart.actors.detection.stub import StubDetection

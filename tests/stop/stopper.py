@@ -1,7 +1,5 @@
 """`rampart-stop` compiled, running, with the sockets of its two neighbours."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import socket

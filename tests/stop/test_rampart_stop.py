@@ -1,7 +1,5 @@
 """`rampart-stop`: zero whatever its sender does."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import signal

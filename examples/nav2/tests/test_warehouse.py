@@ -1,7 +1,5 @@
 """Rounds in virtual time, each with something going wrong, and one on processes."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tug: its floor, its own detection module, its judge, and whole runs with faults."""
 
-from __future__ import annotations
-
 import asyncio
 import random
 import socket

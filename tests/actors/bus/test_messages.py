@@ -1,7 +1,5 @@
 """Fields of messages: each is bounded, and is found by its name; beyond a bound nothing arrives."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import re

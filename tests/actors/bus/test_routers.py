@@ -1,7 +1,5 @@
 """The bus over Zenoh: a client connects to one router and changes to the other when it dies."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import multiprocessing

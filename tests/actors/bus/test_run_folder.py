@@ -1,7 +1,5 @@
 """The folder of a run: access, issued incarnations, and remains of dead runs."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """Ready-made detection modules: timelines of monitors, and reports on the bus."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Callable, Collection

@@ -1,7 +1,5 @@
 """The history of faults over runs: debounced, and never a reason for a run to stop."""
 
-from __future__ import annotations
-
 import sqlite3
 
 import pytest

@@ -3,8 +3,6 @@
 Nor does a forged later incarnation mute a recovery module, or a source of commands.
 """
 
-from __future__ import annotations
-
 import asyncio
 from functools import partial
 

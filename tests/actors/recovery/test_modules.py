@@ -1,7 +1,5 @@
 """Recovery modules that a specification alone makes: `Hold`, `Call`, `Respawn`, and its group."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

@@ -7,8 +7,6 @@ folder as a successor would, and prints one JSON line: whether the child ended e
 acknowledged, and the states found.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

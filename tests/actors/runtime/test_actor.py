@@ -1,7 +1,5 @@
 """Actors on both buses: what a node may rely on, whichever carries its messages."""
 
-from __future__ import annotations
-
 import ast
 import asyncio
 import inspect

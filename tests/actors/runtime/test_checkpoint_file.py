@@ -1,7 +1,5 @@
 """Checkpoints on disk: what is found again, and what every kind of damage leads to."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """Parameters of actors: a specification may set those that the class declares, and no others."""
 
-from __future__ import annotations
-
 import collections
 import re
 from typing import Any

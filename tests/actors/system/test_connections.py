@@ -1,7 +1,5 @@
 """Connections of a system's actors are checked before a run, and errors are one line."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 import textwrap

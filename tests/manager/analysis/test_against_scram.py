@@ -3,8 +3,6 @@
 Needs Debian's package `scram` (GPL-3, neither linked nor shipped): `make test-nightly` asks for it.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

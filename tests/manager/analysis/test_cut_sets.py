@@ -1,7 +1,5 @@
 """Minimal cut sets against brute force, and against counts that are known."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Open-PSA files: what other tools write, and what nobody should."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from itertools import combinations
 from typing import Any

@@ -1,7 +1,5 @@
 """The table of all ordered pairs is what the running manager does."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 

@@ -1,7 +1,5 @@
 """The arbiter as timelines: what is reported, what is ordered, and when."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import msgspec

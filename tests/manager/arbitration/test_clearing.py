@@ -1,7 +1,5 @@
 """How mechanisms clear: by themselves, by an operator, or never."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import math

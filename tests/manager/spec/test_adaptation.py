@@ -1,7 +1,5 @@
 """Changes while running: what is made of a document, and what the manager does with it."""
 
-from __future__ import annotations
-
 import asyncio
 import copy
 from functools import partial

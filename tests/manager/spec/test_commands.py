@@ -1,7 +1,5 @@
 """Commands as nodes in a system spec: every mistake is one line that names the node."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """The shipped system loads; every way to get a spec wrong is refused in one line that helps."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart import SpecificationError, parse_specification
