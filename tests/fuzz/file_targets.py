@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 
 import msgspec
-import numpy as np
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
@@ -36,9 +35,9 @@ from tests import CELL, ROOT, TANK
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 from tests.fuzz.target import target
 
-SYSTEMS = ROOT / "systems"
 _CELL = CELL.read_text("utf-8")
-_PAPER = (SYSTEMS / "paper.toml").read_text("utf-8")
+_PAPER = (ROOT / "systems/paper.toml").read_text("utf-8")
+
 
 @cache
 def _kept() -> tempfile.TemporaryDirectory[str]:
@@ -75,26 +74,13 @@ def airport_toml(data: bytes) -> None:
             "nodes": [*GRAPH["nodes"], {"id": "N3", "x": 5, "y": 4}],
             "edges": [["N1", "N2"], ["N2", "N3"]]}).encode()])
 def graph(data: bytes) -> None:
-    if not (folder() / "foreign/field.png").exists():
-        written("foreign/field.png", _image("PNG", size=480))
-    load_airport(written("foreign/field.graph", data))
-
-
-def _image(form: str, mode: str = "RGB", size: int = 48) -> bytes:
-    pixels = np.zeros((size, size, 3), dtype=np.uint8)
-    pixels[..., 0] = 255
-    pixels[8:size - 8, 8:size - 8] = (0, 255, 0)
-    out = io.BytesIO()
-    Image.fromarray(np.kron(pixels, np.ones((2, 2, 1), dtype=np.uint8))).convert(mode).save(
-        out, form)
-    return out.getvalue()
+    file = written("foreign/field.graph", data)
+    if not (area := file.with_suffix(".png")).exists():
+        Image.new("RGB", (960, 960), "lime").save(area)
+    load_airport(file)
 
 
 # -- systems ---------------------------------------------------------------------------------------
-
-_WORDS = ("[[node]]\n", "[[event]]\n", "enabled = false\n", "parameters = {}\n", 'watch = ["a"]\n',
-          "[orders.b]\n", "timeout_s = 1e-9\n", "at_least", "nan", "[robot]\n", "latched = true\n")
-
 
 @target("toml", refuses=(FileError,), form="toml", one_line=True,
         samples=lambda: [b'a.b = [1, {c = "x"}, 1979-05-27]\n[t]\ns = \'\'\'x\'\'\'\n"q" = """y"""',
@@ -104,7 +90,7 @@ def toml_document(data: bytes) -> None:
 
 
 @target("system", refuses=(SpecificationError,), form="toml", one_line=True,
-        words=_WORDS,
+        words=("[[node]]\n", "enabled = false\n", "[orders.b]\n", "timeout_s = 1e-9\n", "at_least"),
         samples=lambda: [*[TANK.encode()] * 9, _CELL.encode(), _PAPER.encode()])
 def system(data: bytes) -> None:
     spec = parse_specification(data.decode(errors="replace"), "system.toml")
