@@ -35,7 +35,7 @@ class World:
     track: list[tuple[float, float]] = field(default_factory=list)
     least_clearance_m: float = math.inf
 
-    def scan(self, rays: int = 271, range_max_m: float = 10.0, noise_m: float = 0.0) -> Array:
+    def scan(self, noise_m: float = 0.0, rays: int = 271, range_max_m: float = 10.0) -> Array:
         """Echoes of a 270 degree laser at `base_link`, shape (n, 2)."""
         angles = np.linspace(-0.75 * math.pi, 0.75 * math.pi, rays)
         directions = np.column_stack((np.cos(angles), np.sin(angles)))
@@ -86,12 +86,10 @@ class World:
 Gate = Callable[[float, float, Array], tuple[float, float]]
 
 
-def drive(world: World, follower, seconds: float, gate: Gate | None = None, each=None):
+def drive(world: World, follower, seconds: float, gate: Gate | None = None):
     """Run a follower in the world until it arrives or time is up; return the last Motion."""
     motion = None
-    for tick in range(round(seconds / DT_S)):
-        if each is not None:
-            each(tick * DT_S)
+    for _ in range(round(seconds / DT_S)):
         points = world.scan(noise_m=0.01)
         motion = follower.step(world.x_m, world.y_m, world.yaw_rad, points, DT_S)
         if motion.arrived:
