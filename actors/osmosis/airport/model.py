@@ -86,7 +86,6 @@ MAX_NAME = 200
 Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
 Point = tuple[float, float]
 GoalMode = Literal["taxi", "light verification"]
-GOAL_MODES: tuple[GoalMode, ...] = ("taxi", "light verification")
 ObstacleShape = Literal["cylinder", "box"]
 GRAPH_REACH_M = 3.0
 """Largest distance of a mission point from the graph."""
