@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.following.path_follower import PathFollower, field
+from rampart.actors.osmosis.control.following.path_follower import PathFollower, field, repulsion
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import Polyline
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive
@@ -92,6 +92,18 @@ def test_speed_turn_and_accelerations_stay_within_limits():
         last = now
         world.move(*now)
     assert motion.arrived
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_repulsion_pushes_away_the_more_the_nearer_and_only_within_its_influence(along):
+    def push(distance_m):
+        echo = np.zeros((1, 2))
+        echo[0, along] = distance_m + (HULL.half_length_m, HULL.half_width_m)[along]
+        return repulsion(echo, HULL)
+
+    near, nearer = push(0.3), push(0.1)
+    assert nearer[along] < near[along] < 0.0 == near[1 - along]
+    assert push(0.91) == (0.0, 0.0)
 
 
 @given(st.floats(-0.3, 0.3), st.floats(0.4, 2.0))
