@@ -120,23 +120,14 @@ async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops
         await stops(world)
         await key(tab, "ArrowDown", down=False)
 
-
-@pytest.mark.usefixtures("patient")
-async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, tab):
-    for name, held in (("Alt", 1), ("Control", 2), ("Meta", 4)):
+    for name, held in (("Alt", 1), ("Control", 2), ("Meta", 4)):  # a key let go under another one
         await drive_ahead(tab, world)
         await key(tab, f"{name}Left", down=True, modifiers=held)
         await stops(world)
         await key(tab, "w", down=False, modifiers=held)
         await key(tab, f"{name}Left", down=False)
         await stops(world)
-    await drive_ahead(tab, world)
-    await key(tab, "w", down=False)
-    await stops(world)
 
-
-@pytest.mark.usefixtures("patient")
-async def test_the_page_says_why_teleoperation_does_not_follow_it(world, tab):
     await drive_ahead(tab, world)
     world.others.publish(bus_topics.DIAGNOSTIC, bm.Diagnostic(
         "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
@@ -219,8 +210,10 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world, tab):
     await stops(world)  # meant for another window
 
 
-@pytest.mark.parametrize("hmi", [{"launcher_pid": 1}], indirect=True)
-async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, tab, monkeypatch):
+@pytest.mark.parametrize("hmi", [{"launcher_pid": 1, "faults": OsmosisFaults().offered(),
+                                  "system": shipped_system()}], indirect=True)
+async def test_a_node_is_signalled_by_a_second_press_a_strategy_chosen_and_a_fault_injected(
+        world, tab, monkeypatch):
     sent = []
 
     def signal_node(node: str, name: str, _port: int) -> RunProcess:
@@ -243,10 +236,6 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, tab,
         await eventually(lambda: sent == [("osmosis_control", "KILL")])
         await tab.until("$('#toast').textContent === 'osmosis_control (pid 77): KILL'")
 
-
-@pytest.mark.parametrize("hmi", [{"faults": OsmosisFaults().offered(),
-                                  "system": shipped_system()}], indirect=True)
-async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world, tab):
     await tab.until("!$('#strategy-set').disabled")
     assert await tab.value("$('#strategy-name').value") == "safety-first"
     await tab.value("$('#strategy-name').value = 'mission-first';$('#strategy-set').click()")

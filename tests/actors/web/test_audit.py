@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import subprocess
-import sys
 
 import pytest
 
@@ -53,22 +50,6 @@ def test_a_line_says_who_when_what_and_what_came_of_it(file, log):
     assert second["outcome"] == "refused"
     assert [line.outcome for line in read_audit(file)] == ["accepted", "refused"]
     assert file.stat().st_mode & 0o777 == 0o600
-
-
-def test_lines_of_a_process_that_is_killed_are_there_and_its_successor_goes_on(file, made):
-    code = ("import sys, time; from pathlib import Path\n"
-            "from rampart.actors.web.audit import AuditLog\n"
-            "log = AuditLog(Path(sys.argv[1]), lambda: 1.0, print, time.monotonic)\n"
-            "for i in range(50): log.write('reset', who='anna', asked={'n': i})\n"
-            "print('written', flush=True); time.sleep(60)")
-    with subprocess.Popen([sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE,
-                          text=True) as writer:
-        assert writer.stdout.readline() == "written\n"
-        writer.send_signal(signal.SIGKILL)
-    made.log(file).write("close", who="anna")
-    lines = read_audit(file)
-    assert [line.asked["n"] for line in lines[:-1]] == list(range(50))
-    assert lines[-1].what == "close"
 
 
 def test_of_visitors_without_a_token_one_line_a_second_is_kept_and_the_others_counted(

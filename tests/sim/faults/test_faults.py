@@ -131,17 +131,6 @@ def test_every_fault_changes_real_messages_of_its_topic_and_leaves_them_readable
             assert [why for _, _, why in publisher.gate.take_news() if why] == []
 
 
-def test_every_published_topic_has_all_modes_that_make_sense():
-    for key in KEYS:
-        found = modes_of(key, topics.ALL)
-        assert [name for name in SYSTEMATIC if name.endswith(f":{key}")] == [
-            f"{mode}:{key}" for mode in found]
-        if key.startswith(("world/", "inject/")):
-            assert found == ()
-        else:
-            assert set(MODES) - set(found) <= {"corrupt"}
-
-
 # -- generic corruption --------------------------------------------------------------------------
 
 
