@@ -207,16 +207,14 @@ async def test_a_page_that_cannot_or_must_not_be_served_is_not_and_the_reason_re
 # -- Every request of a page with every role: the server decides, whatever the page shows --
 
 
-NEEDS = {"reset": Role.DRIVE, "stick": Role.DRIVE, "mission": Role.DRIVE, "order": Role.DRIVE,
-         "strategy": Role.INJECT, "signal": Role.INJECT, "inject": Role.INJECT,
-         "end-fault": Role.INJECT}
-"""Each kind of request that there is, and who may make it: a new one has to be put here."""
-
 SAMPLES = {
-    "reset": {"recovery": "RM1"}, "strategy": {"name": "mission-first"},
-    "signal": {"node": "localization", "signal": "KILL"}, "inject": {"fault": "gps-bias"},
-    "end-fault": {"injection": "x"}, "stick": {"panel": "Drive", "held": True},
-    "mission": {"name": "A"}, "order": {"action": "pause"}}
+    "reset": (Role.DRIVE, {"recovery": "RM1"}),
+    "stick": (Role.DRIVE, {"panel": "Drive", "held": True}),
+    "mission": (Role.DRIVE, {"name": "A"}), "order": (Role.DRIVE, {"action": "pause"}),
+    "strategy": (Role.INJECT, {"name": "mission-first"}),
+    "signal": (Role.INJECT, {"node": "localization", "signal": "KILL"}),
+    "inject": (Role.INJECT, {"fault": "gps-bias"}), "end-fault": (Role.INJECT, {"injection": "x"})}
+"""Each kind of request that there is, and who may make it: a new one has to be put here."""
 
 
 def test_a_request_of_ones_own_is_for_those_who_may_do_everything_unless_it_says_otherwise():
@@ -241,13 +239,13 @@ async def test_what_a_role_lacks_the_server_refuses_and_nothing_happens(world, t
 
         hmi._server._handlers = msgspec.structs.replace(handlers, fulfil=fulfil)
         barred = (await hear(page, "visitor"))["barred"]
-        for kind, sample in SAMPLES.items():
+        for kind, (needed, sample) in SAMPLES.items():
             answer = await ask(page, type=kind, **sample)
-            if not role.may(NEEDS[kind]):
-                why = f"Needs the role {NEEDS[kind]}; anna has the role {role}"
+            if not role.may(needed):
+                why = f"Needs the role {needed}; anna has the role {role}"
                 assert answer == {"type": "error", "text": why}
                 assert barred.pop(kind) == why
-        assert asked == [kind for kind in SAMPLES if role.may(NEEDS[kind])]
+        assert asked == [kind for kind, (needed, _) in SAMPLES.items() if role.may(needed)]
         assert barred == {}
     if not asked:
         assert [*world.others.requests, *world.others.orders, *world.others.resets,

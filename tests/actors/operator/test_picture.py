@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import asynccontextmanager
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from rampart.actors.operator.picture import JOURNAL_LINES, Picture
 from rampart.actors.operator.state import STALE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.page.state import POINTS, OsmosisState, thin
+from rampart.testing import eventually
 
 
 def as_json(value: object) -> dict:
@@ -93,85 +95,54 @@ def test_an_obstacle_that_a_single_ray_has_hit_stays_in_the_thinned_sweep():
 # ---- the push ------------------------------------------------------------------------------------
 
 
-class Line:
-    """A connection to a page: what was sent, and whether it is taken."""
+@asynccontextmanager
+async def pushing():
+    """Yield state, page, frames and task of a feed with one page, which has received all."""
+    state, frames = OsmosisState(), []
+    state.log(0.0, "note", "before")
+    feed = Feed(state, lambda: 1.0, lambda: {"type": "hello"})
 
-    def __init__(self) -> None:
-        self.frames: list[dict] = []
-        self.taken = asyncio.Event()
-        self.taken.set()
-        self.arrived = asyncio.Condition()
+    async def send(text: str) -> None:
+        frames.append(json.loads(text))
 
-    async def send(self, text: str) -> None:
-        await self.taken.wait()
-        async with self.arrived:
-            self.frames.append(json.loads(text))
-            self.arrived.notify_all()
-
-    async def until(self, condition) -> None:
-        async with asyncio.timeout(5), self.arrived:
-            await self.arrived.wait_for(lambda: condition(self.frames))
-
-
-class Pushing:
-    """A feed with one page on it."""
-
-    def __init__(self) -> None:
-        self.state = OsmosisState()
-        self.looks = 0
-        self.feed = Feed(self.state, lambda: 1.0, lambda: {"type": "hello"}, self._look)
-        self.line = Line()
-
-    def _look(self) -> None:
-        self.looks += 1
-
-    async def __aenter__(self):
-        self._open = self.feed.page()
-        self.page = self._open.__enter__()
-        self.task = asyncio.create_task(self.feed.push(self.page, self.line.send))
-        return self
-
-    async def __aexit__(self, *_):
-        self.task.cancel()
-        await asyncio.wait([self.task])
-        self._open.__exit__(None, None, None)
+    with feed.page() as page:
+        task = asyncio.create_task(feed.push(page, send))
+        await eventually(lambda: len(frames) >= 2)
+        try:
+            yield state, page, frames, task
+        finally:
+            task.cancel()
+            await asyncio.wait([task])
 
 
 async def test_a_page_is_greeted_then_gets_everything_then_changes():
-    pushing = Pushing()
-    pushing.state.log(0.0, "note", "before")
-    async with pushing as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-        hello, whole = p.line.frames[:2]
+    async with pushing() as (state, _, frames, _):
+        hello, whole = frames[:2]
         assert hello == {"type": "hello"}
         assert [e["text"] for e in whole["events"]] == ["before"]
-        assert set(p.state.picture.changes(0)) <= set(whole)
-        p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, "", 0), 1.0)
-        await p.line.until(lambda frames: frames[-1].get("pilot"))
-        assert set(p.line.frames[-1]) == {"type", "version", "time_s", "pilot", "left_out"}
+        assert set(state.picture.changes(0)) <= set(whole)
+        state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, "", 0), 1.0)
+        await eventually(lambda: bool(frames[-1].get("pilot")))
+        assert set(frames[-1]) == {"type", "version", "time_s", "pilot", "left_out"}
 
 
-async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest():
-    async with Pushing() as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
+async def test_a_page_that_answers_has_one_frame_on_the_way_and_then_the_newest():
+    async with pushing() as (state, page, frames, _):
         for i in range(30):
-            p.page.seen(0)  # an older frame than the last
-            p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
+            page.seen(0)  # an older frame than the last
+            state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
             await asyncio.sleep(hmi_feed.FRAME_GAP_S / 4)
-        on_the_way = len(p.line.frames) - 1
-        assert on_the_way <= 2
-        version = p.line.frames[-1]["version"]
-        p.page.seen(version)
-        await p.line.until(lambda frames: frames[-1].get("pilot", {}).get(
-            "value", {}).get("reason") == "29")
-        assert len(p.line.frames) - 1 == on_the_way + 1
+        on_the_way = len(frames)
+        assert on_the_way <= 3  # the greeting, everything, and the first change
+        page.seen(frames[-1]["version"])
+        await eventually(lambda: frames[-1]["pilot"]["value"]["reason"] == "29")
+        assert len(frames) == on_the_way + 1
 
 
 async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.3)
-    async with Pushing() as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-        p.page.seen(0)
-        p.state.log(1.0, "note", "news")
+    async with pushing() as (state, page, _, task):
+        page.seen(0)
+        state.log(1.0, "note", "news")
         with pytest.raises(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(p.task), 5)
+            await asyncio.wait_for(asyncio.shield(task), 5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,19 +12,14 @@ from rampart.actors.web import audit
 from rampart.actors.web.audit import STRANGERS_S, AuditLog, read_audit
 
 
-class World:
-    def __init__(self) -> None:
-        self.now_s = 12.3456
-        self.real_s = 1000.0
-        self.told: list[str] = []
-
-    def log(self, file) -> AuditLog:
-        return AuditLog(file, lambda: self.now_s, self.told.append, lambda: self.real_s)
-
-
 @pytest.fixture
-def made() -> World:
-    return World()
+def made():
+    """Simulated and real time, and what was complained of."""
+    return SimpleNamespace(now_s=12.3456, real_s=1000.0, told=[])
+
+
+def log_in(made, file) -> AuditLog:
+    return AuditLog(file, lambda: made.now_s, made.told.append, lambda: made.real_s)
 
 
 @pytest.fixture
@@ -33,7 +29,7 @@ def file(tmp_path):
 
 @pytest.fixture
 def log(made, file) -> AuditLog:
-    return made.log(file)
+    return log_in(made, file)
 
 
 def test_a_line_says_who_when_what_and_what_came_of_it(file, log):
@@ -76,7 +72,7 @@ def test_a_full_file_says_so_in_its_last_line_and_grows_no_more(file, log, made,
 
 def test_a_file_that_cannot_be_written_keeps_nobody_from_acting_and_is_told_once(tmp_path, made):
     file = tmp_path / "gone" / "audit.jsonl"
-    log = made.log(file)
+    log = log_in(made, file)
     for _ in range(3):
         log.write("reset", who="anna")
     assert made.told == [
@@ -102,14 +98,14 @@ def test_a_link_in_the_place_of_the_file_is_not_followed_and_without_a_file_noth
         tmp_path, made):
     (tmp_path / "elsewhere").write_text("mine")
     (tmp_path / "audit.jsonl").symlink_to(tmp_path / "elsewhere")
-    made.log(tmp_path / "audit.jsonl").write("reset", who="anna")
+    log_in(made, tmp_path / "audit.jsonl").write("reset", who="anna")
     assert (tmp_path / "elsewhere").read_text() == "mine"
     assert len(made.told) == 1
-    made.log(None).write("reset")
+    log_in(made, None).write("reset")
     assert read_audit(tmp_path / "nothing") == ()
 
 
 def test_a_long_request_is_kept_without_what_it_asked(file, made):
-    made.log(file).write("order", who="anna", asked={"reason": "x" * 5000}, why="y" * 5000)
+    log_in(made, file).write("order", who="anna", asked={"reason": "x" * 5000}, why="y" * 5000)
     (line,) = read_audit(file)
     assert (line.what, line.asked, len(line.why)) == ("order", {}, 500)
