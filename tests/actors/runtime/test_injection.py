@@ -14,8 +14,6 @@ from msgspec import structs
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Injection
-from rampart.actors.ftm import messages as fm
-from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import (
     Goal,
@@ -301,9 +299,9 @@ def test_a_misfit_that_only_the_message_shows_ends_the_injection_and_leaves_the_
 
 
 class Talker(Actor):
-    """Publishes a pose ten times a second, and a reset once a second."""
+    """Publishes a pose ten times a second."""
 
-    outputs = (topics.POSE, ftm_topics.RESET)
+    outputs = (topics.POSE,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -313,8 +311,6 @@ class Talker(Actor):
     def speak(self) -> None:
         self.said += 1
         self.publish(topics.POSE, Pose(float(self.said), 0.0, 0.0))
-        if self.said % 10 == 0:
-            self.publish(ftm_topics.RESET, fm.Reset("RM1", str(self.said)))
 
 
 class Listener(Actor):
@@ -323,15 +319,10 @@ class Listener(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.poses: list[float] = []
-        self.resets: list[str] = []
 
     @on(topics.POSE)
     def pose(self, message: Pose, _header: Header) -> None:
         self.poses.append(message.x_m)
-
-    @on(ftm_topics.RESET)
-    def reset(self, message: fm.Reset, _header: Header) -> None:
-        self.resets.append(message.by)
 
 
 class Scene(System):
@@ -356,14 +347,12 @@ class Scene(System):
 @within(Scene)
 async def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice(scene):
     scene.inject(topics.POSE, "duplicate", 9.0)
-    scene.inject(ftm_topics.RESET, "duplicate", 9.0, name="another")
     await asyncio.sleep(3.05)
     assert len(scene.wire) == 2 * 30
     assert scene.wire[::2] == scene.wire[1::2]
     sequences = [heard.header.sequence for heard in scene.wire[::2]]
     assert sequences == sorted(set(sequences))
     assert scene.listener.poses == [float(i) for i in range(1, 31)]
-    assert scene.listener.resets == ["10", "20", "30"]
 
 
 @pytest.mark.parametrize(("duration_s", "ended_s", "end", "heard"), [

@@ -31,7 +31,6 @@ WRONG = [
     (COMMAND, "command = ['']", "wheels: command = .*: expected the name of a program"),
     (COMMAND, 'command = ["./wheels", "\\u0000"]', "wheels: command = .* null character"),
     (COMMAND, f'{COMMAND}\nenv = {{ "A=B" = "x" }}', "wheels: env.A=B = 'x': expected a name"),
-    (COMMAND, f'{COMMAND}\nenv = {{ RAMPART_NODE = "x" }}', "wheels: env.RAMPART_NODE = 'x': exp"),
     (BEAT, 'heartbeat = { key = "a", topic = "tug/wheels", timeout_s = 0.5 }',
      "wheels: heartbeat = .*: expected one of key = "),
     (BEAT, 'heartbeat = { topic = "tug/command", timeout_s = 0.5 }',
@@ -41,7 +40,6 @@ WRONG = [
     ('hears = ["tug/command"]', 'hears = ["detection/{name}"]', "wheels: hears = .*: exp"),
     ('stand_in = "cart:VirtualWheels"', "parameters = { radius_m = 0.1 }", "wheels: parameters: "),
     (f'{COMMAND}\nkind = "control"', f'{COMMAND}\nkind = "manager"', "wheels: comm.*: exp.* actor"),
-    (BEAT, f"{BEAT}\nlimits = {{ memory = 1 }}", "node wheels: limits.memory = 1: unknown field"),
 ]
 
 
