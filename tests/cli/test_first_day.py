@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from rampart.cli import output
 from rampart.cli.main import main
 from rampart.cli.operate import kill_node
 from rampart.testing import RealRun
@@ -28,15 +27,6 @@ def test_the_environment_names_the_run(refused, monkeypatch):
     assert refused("status", "--port", "31998").startswith("rampart: --port 31998: ")
     monkeypatch.setenv("RAMPART_PORT", "74x0")
     assert "RAMPART_PORT=74x0: expected a whole number" in refused("status")
-
-
-def test_a_name_among_many_is_answered_by_the_nearest_three(refused):
-    told = refused("topic", "info", "control/comand", "--system", "osmosis")
-    assert told.startswith("rampart: unknown topic 'control/comand'; the nearest of ")
-    assert told.endswith(": control/command, control/standby_command, control/status\n")
-    assert str(output.unknown("topic", "?", map(str, range(20)))) == (
-        "unknown topic '?'; none of 20 is similar")
-    assert str(output.unknown("order", "x", ["a", "b"])) == "unknown order 'x'; known: a, b"
 
 
 def test_every_object_says_its_format(capsys):

@@ -49,7 +49,7 @@ def test_a_system_that_is_not_sound_is_one_line_and_exit_code_2(
     assert TEXT.count(change[0]) == 1
     file = tmp_path / "cell.toml"
     file.write_text(TEXT.replace(*change))
-    for verb in ("check", "explain", "verify"):
+    for verb in ("check", "explain", "verify") if line.startswith("$: ") else ("check",):
         assert refused(verb, file).startswith(f"rampart: {file}: {line}")
     out, err = said(capsys, "check", str(file), "--json", code=2)
     found = json.loads(out)
