@@ -81,13 +81,11 @@ class HmiState:
         self._aged: list[str] = []
         self._patience_s: dict[str, float] = {}
         self._traces: dict[str, Trace] = {}
-        self._detections: dict[str, fm.DetectionView] = {}
         self.narrator = Narrator()
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
         picture.section("order", {"number": 0, "text": ""})
         self.aged("manager", "nodes")
-        picture.section("detections", [])
         picture.section("usage", {})
         picture.section("behind", "")
         picture.section("history", [])
@@ -137,11 +135,9 @@ class HmiState:
 
     def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
         """Keep the manager's status, and log changes of detections."""
-        self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
         self.keep("manager", status, now_s)
-        self._show_detections(False)
-        for name, view in self._detections.items():
-            self._log_lines(self.narrator.detection(name, view.active, view.reason), now_s)
+        for view in status.detections[:SHOWN.items]:
+            self._log_lines(self.narrator.detection(view.name, view.active, view.reason), now_s)
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision to the decision log."""
@@ -188,9 +184,3 @@ class HmiState:
                     self._patience_s.get(name, STALE_S)):
                 continue
             self.picture.put(name, msgspec.structs.replace(heard, stale=True))
-            if name == "manager":
-                self._show_detections(True)
-
-    def _show_detections(self, stale: bool) -> None:
-        self.picture.put("detections", [{**msgspec.structs.asdict(view), "stale": stale}
-                                        for view in self._detections.values()])

@@ -173,12 +173,12 @@ async function hello(message) {
 /** Parts of the page, each with its sections. */
 const PARTS = [
   [["operating"], (s) => { if (s.operating) operating.show(s.operating); }],
-  [["manager", "detections"], safety],
+  [["manager"], (s) => safety(s.manager)],
   [["order"], (s) => told(s.order)],
   [["left_out"], (s) => leftOut(s.left_out)],
   [["system"], (s) => system(s.system)],
-  [["system", "manager", "detections"], (s) => {
-    say($("tree-words"), tree.show(s.manager, s.detections));
+  [["system", "manager"], (s) => {
+    say($("tree-words"), tree.show(s.manager));
     order.show(s.manager);
   }],
   [["nodes", "usage"], (s) => processes.show(s.nodes, s.usage)],
@@ -239,10 +239,10 @@ function system(drawn) {
   say($("order-words"), `Ordered by ${drawn.criteria.join(", then ")}: upper recoveries are preferred. ${drawn.note}`);
 }
 
-function safety(s) {
-  manager(s.manager);
-  $("detections").replaceChildren(...s.detections.map((d) => {
-    const silent = d.stale || s.manager?.value.silent.includes(d.name);
+function safety(heard) {
+  manager(heard);
+  $("detections").replaceChildren(...(heard?.value.detections ?? []).map((d) => {
+    const silent = heard.stale || heard.value.silent.includes(d.name);
     const chip = element("li", d.active ? "active" : silent ? "stale" : "", `${d.active ? "▲ " : silent ? "? " : ""}${d.name}`);
     const nodes = d.nodes.length ? ` (${d.nodes.join(", ")})` : "";
     const state = d.active ? `${d.reason}${nodes}` : silent ? "silent" : "idle";

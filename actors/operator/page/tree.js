@@ -86,10 +86,10 @@ export class FaultTree {
   }
 
   /** Mark detected events, the events above them, and the next barriers. */
-  show(manager, detections) {
-    const status = manager ? manager.value : { active: [], activated: [], latched: [], silent: [] };
+  show(manager) {
+    const status = manager ? manager.value : { active: [], activated: [], detections: [], silent: [] };
     const stale = !manager || manager.stale;
-    const reasons = new Map((detections || []).map((d) => [d.name, d]));
+    const reasons = new Map(status.detections.map((d) => [d.name, d]));
     const occurred = new Set();
     const led = new Set();
     const words = [];
