@@ -239,6 +239,7 @@ class MotionParity:
 
     Attributes:
         gyro_agrees: whether the gyro turns like the wheels.
+        gyro: the checked IMU.
     """
 
     def __init__(self) -> None:
@@ -253,7 +254,7 @@ class MotionParity:
         self._lag = [0.0, 0.0]
         self._own = 0.0
         self._turned = [(0.0, 0.0)] * len(_TURNS_S)
-        self._imu = ImuCheck()
+        self.gyro = ImuCheck()
 
     def confirmed(self, now_s: float) -> bool:
         """Whether encoders are received and confirm complete odometry."""
@@ -274,7 +275,7 @@ class MotionParity:
 
     def imu(self, reading: m.Imu, stamp_s: float, now_s: float) -> None:
         """Take the gyro's heading."""
-        self._imu.take(stamp_s, reading, now_s)
+        self.gyro.take(stamp_s, reading, now_s)
 
     def odometry(self, reading: m.Odometry, stamp_s: float, now_s: float) -> None:
         """Take odometry and compare its turn with the gyro's."""
@@ -301,14 +302,14 @@ class MotionParity:
 
     def _compare_turns(self, wheels_rad: float, dt_s: float) -> None:
         stamp_s = self._odometry_s
-        gyro_s, gyro_yaw = self._imu.stamp_s, self._imu.yaw_rad
+        gyro_s, gyro_yaw = self.gyro.stamp_s, self.gyro.yaw_rad
         gyro_was = self._gyro_was
         self._gyro_was = gyro_yaw if stamp_s - gyro_s <= _GYRO_FRESH_S else None
         if gyro_was is None or self._gyro_was is None:
             return
         wheels = math.remainder(wheels_rad, math.tau)
         gyro = math.remainder(gyro_yaw - gyro_was, math.tau)
-        astray = bool(self._imu.distrust)
+        astray = bool(self.gyro.distrust)
         for which, over_s in enumerate(_TURNS_S):
             off, turned = (each * (1.0 - dt_s / over_s) for each in self._turned[which])
             turned += max(abs(wheels), abs(gyro))

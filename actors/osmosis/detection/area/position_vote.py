@@ -25,7 +25,7 @@ from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.motion_check import MotionParity
-from rampart.actors.osmosis.readings import is_fix, is_imu, is_odometry
+from rampart.actors.osmosis.readings import is_fix, is_odometry
 
 GPS = "GPS"
 WHEELS = "dead reckoning"
@@ -82,7 +82,6 @@ class Track:
         self.stamp_s = -math.inf
         self.speed_mps = 0.0
         self._fresh_s = fresh_s
-        self._imu: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
         self._align_rad = 0.0
         self._wheels_rad = 0.0
         self.parity = MotionParity()
@@ -92,20 +91,18 @@ class Track:
 
     def imu(self, imu: m.Imu, stamp_s: float, now_s: float) -> None:
         """Take the IMU's heading."""
-        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) and is_imu(imu):
-            self._imu = (stamp_s, imu.yaw_rad, imu.yaw_rate_radps)
-            self.parity.imu(imu, stamp_s, now_s)
+        self.parity.imu(imu, stamp_s, now_s)
 
     @property
     def by_gyro(self) -> bool:
         """Whether the heading is the gyro's: it is present and turns like the wheels."""
-        return self._by_gyro and self.stamp_s - self._imu[0] <= self._fresh_s
+        return self._by_gyro and self.stamp_s - self.parity.gyro.stamp_s <= self._fresh_s
 
     @property
     def heading_rad(self) -> float:
         """Heading in `map`."""
         if self.by_gyro:
-            return self._imu[1] + self._align_rad
+            return self.parity.gyro.yaw_rad + self._align_rad
         return (self._fallback_rad or 0.0) + self._wheels_rad
 
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> float:
@@ -120,7 +117,7 @@ class Track:
         self._wheels_rad = yaw_rad
         if self.parity.gyro_agrees is not self._by_gyro:
             if self.parity.gyro_agrees:
-                self._align_rad = self.heading_rad - self._imu[1]
+                self._align_rad = self.heading_rad - self.parity.gyro.yaw_rad
                 self.aligned = False  # by the wheels, which slip in a turn on the spot
             self._by_gyro = self.parity.gyro_agrees
         if dt_s > self._fresh_s:
@@ -160,7 +157,8 @@ class Track:
     @property
     def straight(self) -> bool:
         """Whether the robot drives straight ahead, so that its course is its heading."""
-        return self.speed_mps > _COURSE_FROM_MPS and abs(self._imu[2]) < _STRAIGHT_RADPS
+        turns_radps = abs(self.parity.gyro.rate_radps)
+        return self.speed_mps > _COURSE_FROM_MPS and turns_radps < _STRAIGHT_RADPS
 
     def at(self, stamp_s: float) -> Place:
         """Return the position at a time near the newest odometry."""
