@@ -186,8 +186,8 @@ def test_faults_are_replaced_and_ended_by_name_and_the_worst_on_an_actuator_coun
 def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
     subject = ActuatorFaults(MOTOR)
     subject.order(order, 0.0)
-    still = (0.0,) * 4
-    assert news(subject, 9, still, still, braking=True) == [("f", 0, False)]
+    creep = (0.01,) * 4  # rad/s, as friction leaves it
+    assert news(subject, 9, (0.0,) * 4, creep, braking=True) == [("f", 0, False)]
 
 
 BAD = [
