@@ -109,6 +109,16 @@ def test_a_run_lives_as_long_as_its_folder_is_locked_whatever_its_process_is_cal
     assert not Path(of_a_container).exists()
 
 
+def test_a_forked_process_keeps_the_folder_of_its_run(place):
+    with subprocess.Popen([sys.executable, "-c", _MAKE, str(place), "1"], text=True,
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as maker:
+        assert maker.stdout is not None
+        folder = maker.stdout.readline().strip()
+        assert maker.wait(10) == 0
+        run_folder.make(7452, os.getpid())
+        assert Path(folder).exists()
+
+
 def test_several_may_issue_a_number_of_one_node_at_once(sockets):
     issue = ("import sys; from rampart.actors.bus import run_folder\n"
              "for number in range(int(sys.argv[2]), 20_000, 2): "

@@ -70,6 +70,7 @@ def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
 @pytest.mark.parametrize(("table", "name", "parameters", "words"), [
     ("detections", "DM2", {"timeout_s": True}, "timeout_s = True: expected a number > 0"),
     ("detections", "DM2", {"timeout_s": 0.1}, "timeout_s = 0.1: would raise false alarms"),
+    ("detections", "DM4", {"watch": []}, r"watch = \[\]: expected a list of node names"),
     ("detections", "DM2", {"suspects": ["osmosis"]}, "suspects = .*unknown node 'osmosis'; known"),
     ("detections", "DM9", {"suspects": ["osmosis_control", "osmosis_control"]},
      "suspects = .*: expected osmosis_control and its standby"),

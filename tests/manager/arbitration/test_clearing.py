@@ -15,7 +15,7 @@ from rampart.manager.actor import FtmManager
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
 from rampart.manager.model.mechanisms import Clears
-from rampart.manager.spec.clearing import reset_role
+from rampart.manager.spec.clearing import clearing_in_words, reset_role
 from rampart.testing import run
 from tests.manager.bench import RMS, Bench, Managed, edited, full_system
 
@@ -84,6 +84,16 @@ def test_a_manager_that_is_started_again_knows_since_when_the_error_is_gone():
 def test_a_memory_with_an_impossible_time_is_refused():
     assert objection(Memory(1, held=(("FTM2", math.nan, 0.0),))) == \
         "FTM2 is held since nan s, seen at 0.0 s"
+
+
+def test_words_about_clearing():
+    words = clearing_in_words(edited(
+        FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject", "clear_after_s": 5.0},
+        FTM3={"clears": Clears.NEVER}))
+    assert [words[name] for name in ("FTM1", "RM1", "FTM2", "FTM3", "FTM4")] == [
+        *["clears by operator (role drive) once its error is gone"] * 2,
+        "clears by operator (role inject) once its error is gone for 5 s",
+        "never clears; only a new run ends it", "clears by itself once its error is gone"]
 
 
 def test_a_recovery_needs_the_highest_role_of_its_mechanisms():

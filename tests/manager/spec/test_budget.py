@@ -57,6 +57,12 @@ def test_a_robot_that_cannot_even_brake_in_its_corridor_has_no_time():
     assert time_to_runaway_s(robot) < 0
 
 
+def test_a_guard_that_is_switched_off_needs_no_time():
+    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
+                     ftm=False)
+    assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
+
+
 def test_the_numbers_of_the_shipped_robot():
     assert time_to_drift_s(ROBOT) == pytest.approx(1.25)
     assert time_to_obstacle_s(ROBOT) == pytest.approx(0.55)

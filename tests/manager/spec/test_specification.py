@@ -156,6 +156,7 @@ REFUSED = {
         ("sensing_range_m = 5.0", "sensing_range_m = 0.7")],
     "$.timing.release_hold_max_s = 10.0: expected at least": [
         ("release_hold_s = 0.5 ", "release_hold_s = 20.0 ")],
+    "$.end.after_s = 0: expected a number > 0": [("[layers]", "[end]\nafter_s = 0\n[layers]")],
     "$.supervision.backoff_max_s = 2.0: expected at least": [
         ("[layers]", "[supervision]\nbackoff_s = 3.0\n[layers]")],
 }
@@ -246,6 +247,7 @@ def test_the_mechanism_of_the_page_for_a_lost_link_fits_in_what_it_allows():
         "[[detection]]\n", f"{WHEN_LOST}\n[[detection]]\n", 1)
     lost, = (one for one in check(parse_specification(text, "lost.toml")) if one.name == "FTM15")
     assert (lost.time_left_s, lost.detection_s, lost.fits) == (10.0, 6.2, True)
+    assert lost.hazard == "nobody watches the robot"
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
