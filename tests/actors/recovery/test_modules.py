@@ -454,7 +454,7 @@ async def group(**parameters: Any) -> AsyncIterator[tuple[System, Supervisor, Bo
 
 def asked(supervisor: Supervisor) -> list[str]:
     """The nodes that were asked for, each once."""
-    return list(dict.fromkeys(request.node for _, request in supervisor.requests))
+    return list(dict.fromkeys(request.node for request in supervisor.requests))
 
 
 @pytest.mark.parametrize(("named", "others", "restarted"), [
