@@ -87,7 +87,9 @@ def test_a_run_becomes_the_metrics_that_the_handbook_lists():
 async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a_replay(
         monkeypatch, replay_of):
     run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
-    mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
+    mine = fm.NodeTable((
+        fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),
+        fm.NodeInfo("far", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0, host="ground")))
     looks = []
 
     async def one(*_, **__):
