@@ -88,7 +88,9 @@ WORLD_PAUSE_S = 0.4
 """Simulated seconds: the Safety Pilot misses the laser and stops. After a second an emergency stop
 would follow, the right answer to a robot without senses."""
 
-ROOT_PAUSE_S = (0.3, 1.5)
+ROOT_PAUSE_S = 1.0
+"""Wall seconds."""
+
 GAP_S = 0.4
 """The second of a pair is hit at once, or up to so many wall seconds later."""
 
@@ -120,11 +122,10 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Hit:
-    """A process and how it is hit; wall seconds until it goes on, if it is only paused."""
+    """A process and how it is hit."""
 
     name: str
     way: str
-    pause_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +155,7 @@ class Targets:
 
     def hit(self, dice: random.Random, name: str, ways: Sequence[str] = WAYS) -> Hit:
         """Return a hit of a process in a way that is drawn."""
-        if name in self.paused:
-            return Hit(name, PAUSE, dice.uniform(*ROOT_PAUSE_S) if name == ROOT_PROCESS
-                       else WORLD_PAUSE_S)
-        return Hit(name, dice.choice(ways))
+        return Hit(name, PAUSE if name in self.paused else dice.choice(ways))
 
 
 def load() -> SystemSpec:
@@ -343,7 +341,7 @@ class Chaos:
             at_s = i * strike.gap_s
             due.append((at_s, hit.name, SIGNALS["STOP" if hit.way == PAUSE else hit.way]))
             if hit.way == PAUSE:
-                pause_s = hit.pause_s / (1.0 if hit.name == ROOT_PROCESS else self._rate)
+                pause_s = ROOT_PAUSE_S if hit.name == ROOT_PROCESS else WORLD_PAUSE_S / self._rate
                 due.append((at_s + pause_s, hit.name, signal.SIGCONT))
         begun_s = time.monotonic()
         for at_s, name, number in sorted(due):
@@ -478,7 +476,7 @@ class Log:
     @property
     def lasted_s(self) -> float:
         """Wall seconds of all missions, those that were cut included."""
-        return max((record["at_s"] for record in self.records), default=0.0)
+        return self.records[-1]["at_s"] if self.records else 0.0
 
     def wrong(self) -> list[str]:
         """Return what was not as it has to be."""

@@ -133,18 +133,20 @@ async def test_daemons_that_end_before_it_leave_no_zombies_and_its_own_end_is_to
     assert started.ends == ["ended: exit code 4"]
 
 
-@pytest.mark.parametrize(("file", "code", "reason"), [
-    ("none", 127, "No such file"), ("no_interpreter", 127, "No such file"),
-    ("odd", 127, "not found"), ("not_executable", 126, "Permission denied")])
+@pytest.mark.parametrize(("content", "mode", "end", "reason"), [
+    (None, 0o755, "ended: exit code 127", "No such file"),
+    (b"#!/nowhere/sh\n", 0o755, "ended: exit code 127", "No such file"),
+    (b"\x7fNONSENSE", 0o755, "ended: exit code 127", "not found"),  # setpriv has a shell run it
+    (b"#!/bin/sh\n", 0o644, "ended: exit code 126", "Permission denied")])
 @isolated
-async def test_a_file_that_is_not_a_program_ends_at_once_and_says_why(tmp_path, file, code, reason):
-    (tmp_path / "no_interpreter").write_text("#!/nowhere/sh\n")
-    (tmp_path / "odd").write_bytes(b"\x7fNONSENSE")  # setpriv has a shell run it
-    (tmp_path / "not_executable").write_text("#!/bin/sh\n")
-    for name in ("no_interpreter", "odd"):
-        (tmp_path / name).chmod(0o755)
-    started = Started(tmp_path, "", program=str(tmp_path / file))
-    assert await started.end() == f"ended: exit code {code}"
+async def test_a_file_that_is_not_a_program_ends_at_once_and_says_why(
+        tmp_path, content, mode, end, reason):
+    program = tmp_path / "program"
+    if content is not None:
+        program.write_bytes(content)
+        program.chmod(mode)
+    started = Started(tmp_path, "", program=str(program))
+    assert await started.end() == end
     assert reason in started.log.read_text()
 
 
