@@ -26,9 +26,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import load_run
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
-from rampart.manager.arbitration.arbiter_state import Command, RecoveryHeard
-from rampart.manager.arbitration.detection_track import DetectionHeard
-from rampart.manager.model.mechanisms import RecoveryPhase as Phase
+from rampart.manager.arbitration.arbiter_state import Command
 from rampart.manager.spec.specification import parse_specification
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
@@ -116,27 +114,12 @@ def test_a_follower_that_resumes_stays_on_its_leg_where_the_route_comes_near_its
 # -- the arbiter's memory ------------------------------------------------------------------------
 
 
-def heard_all(arbiter, state, now, active=()):
-    for name in arbiter.mechanisms.detections:
-        state, _ = arbiter.step(state, DetectionHeard(name, name in active), now)
-    for name in arbiter.mechanisms.recoveries:
-        state, _ = arbiter.step(state, RecoveryHeard(
-            name, False, Phase.IDLE, state.desired[name].decision), now)
-    return state
-
-
 def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():
     arbiter = build_arbiter(SPEC)
-    state = heard_all(arbiter, arbiter.initial(0.0), 0.1)
-    for flap in range(6):
-        state = heard_all(arbiter, state, 1.0 + flap, active=("DM6",))
-        state = heard_all(arbiter, state, 1.5 + flap)
-    memory = remember(state, arbiter)
+    memory = Memory(20, (), (("DM6", 2.5, 7.0),))
     back = recall(arbiter, memory, 8.0, 10)
-    assert back.number == max(state.number, 10)
-    buckets = {t.name: t.bucket_s for t in back.detections if t.bucket_s}
-    assert list(buckets) == ["DM6"]
-    assert buckets["DM6"] > 2.0
+    assert [(t.name, t.bucket_s) for t in back.detections if t.bucket_s] == [("DM6", 2.5)]
+    assert remember(back, arbiter) == memory
     assert recall(arbiter, memory, 8.0, 70_000).number == 70_000
 
 
