@@ -77,7 +77,8 @@ def test_only_some_may_say_what_others_obey():
     for key, names in {
             "summit_xl/command": {"safety_pilot"}, "recovery/RM1/command": {"ftm_manager"},
             "supervisor/event": {"supervisor"}, "detection/DM4": {"DM4"},
-            "heartbeat/DM5": {"DM5"}, "inject/order": everybody, "manager/adapt": everybody,
+            "heartbeat/DM5": {"DM5"}, "heartbeat/hmi": {"hmi"}, "diagnostic/hmi": {"hmi"},
+            "inject/order": everybody, "manager/adapt": everybody,
             "world/truth": {"simulator"}}.items():
         assert who(key) == names
     everything = frozenset({"rampart/**"})
