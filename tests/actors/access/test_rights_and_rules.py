@@ -37,6 +37,15 @@ def test_an_identity_that_is_not_in_the_register_has_no_rule_and_a_person_no_nod
     assert set(rules) == {"DM4", "DM5.2", "safety_pilot"}
     assert "inject/order" in said_by(rules["safety_pilot"])
     assert "summit_xl/command" not in said_by(rules["safety_pilot"])
+    own, passed = RIGHTS["DM4"], {(flow, message): keys for flow, messages, keys in rules["DM4"]
+                                  for message in messages}
+    assert passed.items() >= {
+        ("ingress", "put"): own.publishes, ("ingress", "declare_subscriber"): own.subscribes,
+        ("ingress", "query"): own.queries, ("ingress", "declare_queryable"): own.answers,
+        ("ingress", "reply"): own.answers, ("egress", "put"): own.subscribes,
+        ("egress", "reply"): own.queries}.items()
+    assert {message for _, message in passed} == {
+        "put", "declare_subscriber", "query", "declare_queryable", "reply"}
 
 
 def is_heard(member: Member, key: str) -> bool:

@@ -191,8 +191,7 @@ def gets_through(keyed, config):
 
 
 def issued(authority, now=NOW, chain=b""):
-    return new_certificate(authority, "safety_pilot", "node", addresses=(), now=now,
-                           days=8) + chain
+    return new_certificate(authority, "safety_pilot", "node", addresses=(), now=now, days=8) + chain
 
 
 @pytest.mark.parametrize("what", [

@@ -498,8 +498,7 @@ async def test_a_program_that_ends_is_the_next_incarnation_in_the_same_process_a
         world.events.clear()
         node.end_program()
         await eventually(lambda n=incarnation: node.starts[-1:] == [n], 0.01)
-        await eventually(lambda n=incarnation: world.row(OWN) == (
-            "running", n, node.process.pid))
+        await eventually(lambda n=incarnation: world.row(OWN) == ("running", n, node.process.pid))
         assert [event for name, event, _ in world.events if name == OWN] == [
             "crashed", "respawned", "running"]
     assert world.machine.forks == []
