@@ -19,7 +19,6 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import Checkpoints, KeptState, NodeInfo
-from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
@@ -28,7 +27,7 @@ from rampart.actors.supervision import supervisor
 from rampart.actors.supervision.node_process import make_actor
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.testing import eventually, run
+from rampart.testing import VirtualSystem, eventually, run
 from tests.actors.supervision.test_supervisor import Machine
 from tests.two_hosts import two_hosts
 from tests.virtual_time import within
@@ -94,16 +93,14 @@ class Host(Machine):
         """Begin a supervisor, the first one or its replacement."""
         world, plan = self._world, self._plan
         spec = load_system(plan)
-        layout = Layout(plan, spec)
-        member = layout.members[plan.supervisor]
         run_folder.issue(self.folder, [plan.supervisor], incarnation)
-        self.supervisor = member.actor(
-            Context(plan.supervisor, incarnation, world.clock,
-                    VirtualBus(world.hub, plan.supervisor, incarnation), member.parameters,
-                    RunContext(plan, spec, known_incarnations=run_folder.issued(self.folder)),
-                    register=run_folder.register_of(self.folder),
-                    members=frozenset(layout.members)), self, self.made)
-        self.task = asyncio.create_task(self.supervisor.run())
+        system = VirtualSystem(RunContext(
+            plan, spec, known_incarnations=run_folder.issued(self.folder)), Layout(plan, spec))
+        system.hub, system.clock = world.hub, world.clock
+        system.register = run_folder.register_of(self.folder)
+        system.incarnations[plan.supervisor] = incarnation - 1
+        self.supervisor = system.start_node(plan.supervisor, self, self.made)
+        self.task = system.tasks[plan.supervisor]
 
     def made(self, *arguments):
         self.files = Files(self.disk, *arguments)
