@@ -92,6 +92,14 @@ def test_the_less_of_the_brake_is_left_the_longer_the_way():
     assert ways[-1] == pytest.approx(84 * 0.1175**2 / (4 * 0.1), rel=0.1)
 
 
+def test_the_dead_man_brakes_in_vain_as_well():
+    sim = run(world(dead_man_timeout_s=0.4), 1.0, 0.0, 0.4)
+    sim.order_fault(fault(BRAKE))
+    after(sim, 1.0)
+    assert sim.base_status().dead_man_tripped
+    assert sim.truth().twist.linear_mps > 0.3
+
+
 def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_left():
     sim = driving()
     sim.order_fault(fault(BRAKE))
