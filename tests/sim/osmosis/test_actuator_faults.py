@@ -97,7 +97,7 @@ def test_the_dead_man_brakes_in_vain_as_well():
     sim.order_fault(fault(BRAKE))
     after(sim, 1.0)
     assert sim.base_status().dead_man_tripped
-    assert sim.truth().twist.linear_mps > 0.3
+    assert 0.3 < sim.truth().twist.linear_mps < 0.5  # it rolls out
 
 
 def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_left():
