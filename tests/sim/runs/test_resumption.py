@@ -41,23 +41,15 @@ def begun(reports: Path, name: str, system: Path, **changes) -> RunFiles:
     return files
 
 
-def test_the_newest_run_that_did_not_end_is_found(tmp_path, system):
-    reports = tmp_path / "reports"
-    for number, (name, ended) in enumerate((("a", ""), ("b", ""), ("c", "success, safe"))):
-        file = begun(reports, name, system, ended=ended).directory / MANIFEST
-        os.utime(file, (1000 + number, 1000 + number))
-    files, manifest = find(reports, "")
-    assert files.directory == reports / "b"
-    assert manifest.arguments == ("--rate", "2")
-    files.unlock()
-
-
-@pytest.mark.parametrize("which", ["reports/a", "a", "id-a"])
-def test_a_run_is_found_by_directory_name_and_id(tmp_path, system, monkeypatch, which):
+@pytest.mark.parametrize("which", ["", "reports/b", "b", "id-b"])
+def test_a_run_is_found_by_directory_name_and_id_or_as_the_newest_that_did_not_end(
+        tmp_path, system, monkeypatch, which):
     monkeypatch.chdir(tmp_path)
-    begun(tmp_path / "reports", "a", system)
+    for number, (name, ended) in enumerate((("a", ""), ("b", ""), ("c", "success, safe"))):
+        file = begun(tmp_path / "reports", name, system, ended=ended).directory / MANIFEST
+        os.utime(file, (1000 + number, 1000 + number))
     files, manifest = find(Path("reports"), which)
-    assert manifest.run_id == "id-a"
+    assert (manifest.run_id, manifest.arguments) == ("id-b", ("--rate", "2"))
     files.unlock()
 
 
@@ -65,19 +57,16 @@ def damaged(text: str):
     return lambda files: (files.directory / MANIFEST).write_text(text)
 
 
+def kept(**changes):
+    return lambda files: files.save(msgspec.structs.replace(files.manifest(), **changes))
+
+
 @pytest.mark.parametrize(("change", "which", "why"), [
     (lambda files: (files.directory / MANIFEST).unlink(), "a", MANIFEST),
-    (damaged(""), "a", MANIFEST),
-    (damaged("{"), "", MANIFEST),
-    (damaged('{"format": 9}'), "a", MANIFEST),
-    (damaged('{"format": 1, "run_id": 7}'), "a", "run_id"),
-    (lambda files: files.save(msgspec.structs.replace(files.manifest(), format=99)), "a", "99"),
-    (lambda files: files.save(msgspec.structs.replace(files.manifest(), ended="fail, safe")), "a",
-     "has ended (fail, safe)"),
-    (lambda files: files.save(msgspec.structs.replace(files.manifest(), ended="fail, safe")), "",
-     "no run that did not end"),
-    (lambda _files: None, "b", "no such run"),
-])
+    (damaged("{"), "", MANIFEST), (damaged('{"format": 1, "run_id": 7}'), "a", "run_id"),
+    (kept(format=99), "a", "99"), (kept(ended="fail, safe"), "a", "has ended (fail, safe)"),
+    (kept(ended="fail, safe"), "", "no run that did not end"),
+    (lambda _files: None, "b", "no such run")])
 def test_a_run_that_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change, which, why):
     change(begun(tmp_path / "reports", "a", system))
     with pytest.raises(ResumptionError) as refused:
