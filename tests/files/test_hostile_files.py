@@ -22,6 +22,8 @@ from PIL import Image
 from rampart.actors.osmosis.airport.formats import MAX_WARNINGS, load_airport
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.cli.main import main as rampart
+from rampart.files import toml
+from rampart.files.reading import FileError
 from rampart.sim.campaign.job import Job
 from rampart.sim.campaign.store import Store, StoreError
 from tests import ROOT
@@ -236,3 +238,8 @@ def test_a_store_with_a_damaged_row_says_so_when_it_is_read(tmp_path):
     with pytest.raises(StoreError, match="cannot be used"):
         list(store.runs())
     store.close()
+
+
+def test_a_document_of_a_recording_is_bounded_like_a_file():
+    with pytest.raises(FileError, match="longer than 512 kB"):
+        toml.parse("#" * (1 << 20))
