@@ -5,9 +5,8 @@ Kill, stop or hang a node of a running robot.
 Examples:
   kill-node osmosis_control                  # it is restarted
   kill-node localization --signal STOP       # its heartbeat stops: it is replaced
-  kill-node --list                           # list the processes of this machine
-In a system of several hosts it signals nodes of all hosts; `rampart node list` lists
-them. `kill -9 PID` also works.
+In a system of several hosts it signals nodes of all hosts. `rampart node list` lists
+the nodes. `kill -9 PID` also works.
 
 signals:
   KILL   end the process at once (default)
@@ -39,11 +38,11 @@ from rampart.actors.supervision.kill_node import (
     UnknownNodeError,
     signal_node,
 )
-from rampart.actors.supervision.process_title import RunProcess, find_processes
+from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli import completion
 from rampart.cli.output import say
 from rampart.cli.session import connect
-from rampart.cli.verbs import JSON, PORT, add_options, flag, help_of, option
+from rampart.cli.verbs import JSON, PORT, add_options, help_of, option
 from rampart.files import streams
 
 _TABLE_S = 2.0
@@ -72,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser = build_parser()
         argcomplete.autocomplete(parser)
         options = parser.parse_args(arguments)
-        (_list_nodes if options.list else _signal_node)(options)
+        _signal_node(options)
     except (SignalError, ValueError) as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
         return 2
@@ -83,17 +82,15 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog="kill-node", **help_of(__doc__ or ""))
     add_options(parser, (
-        option("node", nargs="?", completer=completion.nodes,
+        option("node", completer=completion.nodes,
                help="name of the node, for example osmosis_control"),
         option("--signal", default="KILL", type=str.upper, metavar="SIG",
                help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE"),
-        PORT, flag("--list", "list the processes of all runs of this machine"), JSON))
+        PORT, JSON))
     return parser
 
 
 def _signal_node(options: argparse.Namespace) -> None:
-    if options.node is None:
-        raise SignalError("expected the name of a node; --list shows the names")
     if options.signal not in SIGNALS:
         raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
     victim = asyncio.run(signal_anywhere(options.node, options.signal, options.port))
@@ -103,16 +100,6 @@ def _signal_node(options: argparse.Namespace) -> None:
     else:
         say(f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
             f"{options.signal}")
-
-
-def _list_nodes(options: argparse.Namespace) -> None:
-    rows = [{"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
-            for p in find_processes(options.port) for name in p.names]
-    if options.json:
-        print(json.dumps(rows))
-        return
-    for row in rows:
-        say("{port:>6} {pid:>8} #{incarnation:<4} {name}".format(**row))
 
 
 async def _signal(node: str, name: str, port: int | None) -> fm.ProcessEvent | None:

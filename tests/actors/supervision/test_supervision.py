@@ -249,8 +249,7 @@ async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(witnes
     for arguments, words in (
             (["DM99", "--port", str(port)], "unknown node 'DM99'"),
             (["DM1", "--signal", "HUG", "--port", str(port)], "unknown signal"),
-            (["DM1", "--port", "1"], "no run found on port 1"),
-            (["--port", str(port)], "expected the name of a node")):
+            (["DM1", "--port", "1"], "no run found on port 1")):
         assert await asyncio.to_thread(kill_node.main, arguments) == 2
         error = capsys.readouterr().err
         assert words in error
