@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import msgspec
 
@@ -29,7 +29,7 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], chosen: Mappin
         return
     group = parser.add_argument_group(f"options of this system ({kind.__name__})")
     for field in fields:
-        plain, extra = _parts(kind, field.name)
+        extra = _described(kind, field.name)
         default = chosen.get(field.name, field.default)
         if crossed:
             default = extra.get("campaign", default)
@@ -39,7 +39,6 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], chosen: Mappin
             f"--{field.name.replace('_', '-')}", dest=f"application_{field.name}",
             default=extra.get("campaign") if crossed else None,
             metavar=f"{metavar},..." if crossed else metavar,
-            type=str if crossed else plain if plain in {int, float} else str,
             help=extra.get("description", "") + shown)
 
 
@@ -64,35 +63,23 @@ def alternatives(options: argparse.Namespace, kind: type[Application]) -> list[d
     for field in msgspec.structs.fields(kind.Options):
         given = getattr(options, f"application_{field.name}", None)
         if given is not None:
-            found[field.name] = [_value(kind, field, _number(kind, field, value))
-                                 for value in given.split(",")]
+            found[field.name] = [_value(kind, field, value) for value in given.split(",")]
     return [dict(zip(found, values, strict=True)) for values in product(*found.values())]
 
 
-def _number(kind: type[Application], field: msgspec.structs.FieldInfo, value: str) -> Any:
-    plain = _parts(kind, field.name)[0]
+def _value(kind: type[Application], field: msgspec.structs.FieldInfo, text: str) -> Any:
     try:
-        return plain(value) if plain in {int, float} else value
-    except ValueError:
-        raise UsageError(f"--{field.name.replace('_', '-')} {value}: must be a number, or several "
-                         "separated by commas") from None
-
-
-def _value(kind: type[Application], field: msgspec.structs.FieldInfo, value: Any) -> Any:
-    try:
-        msgspec.convert(value, field.type)
+        value = msgspec.to_builtins(msgspec.convert(text, field.type, strict=False))
     except msgspec.ValidationError as error:
-        raise UsageError(f"--{field.name.replace('_', '-')} {value}: {error}") from None
-    if _parts(kind, field.name)[1].get("file") and Path(value).exists():
-        return str(Path(value).resolve())
+        raise UsageError(f"--{field.name.replace('_', '-')} {text}: {error}") from None
+    if _described(kind, field.name).get("file") and Path(text).exists():
+        return str(Path(text).resolve())
     return value
 
 
-def _parts(kind: type[Application], name: str) -> tuple[Any, dict[str, Any]]:
-    """Return the plain type of a field, and the `extra` of its `Meta` with `description`."""
+def _described(kind: type[Application], name: str) -> dict[str, Any]:
+    """Return the `extra` of the `Meta` of a field, with its `description`."""
     hint = get_type_hints(kind.Options, include_extras=True)[name]
-    if get_origin(hint) is not Annotated:
-        return hint, {}
-    plain, *notes = get_args(hint)
-    meta = next((note for note in notes if isinstance(note, msgspec.Meta)), msgspec.Meta())
-    return plain, {"description": meta.description or "", **(meta.extra or {})}
+    meta = next((note for note in getattr(hint, "__metadata__", ())
+                 if isinstance(note, msgspec.Meta)), msgspec.Meta())
+    return {"description": meta.description or "", **(meta.extra or {})}

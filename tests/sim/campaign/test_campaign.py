@@ -321,7 +321,7 @@ def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy
     (("--full",), "--full: only with --paper"),
     (("--runs", "0"), "--runs 0: must be 1 or more"),
     (("--fault", "gremlins"), "unknown fault 'gremlins'"),
-    (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be a number"),
+    (("--runs", "3", "--obstacles", "many"), "--obstacles many: Expected `int`"),
     (("--runs", "3", "--obstacles", "99"), "obstacles = 99: expected at most 5 on Vallombre"),
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
