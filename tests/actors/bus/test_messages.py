@@ -187,6 +187,12 @@ async def test_a_value_of_numpy_is_refused_by_topic_and_field(system, message, w
         system.start("gauge", Gauge).publish(LEVEL, message)
 
 
+def test_an_item_that_a_list_lacks_is_named():
+    field = Field(Level, "cells[7]")
+    assert field.beyond(Level(1.5, (1.0, 2.0))) == "cells[7]: no item [7], the list has 2"
+    assert field.beyond(Level(1.5, (1.0,) * 8)) == ""
+
+
 @pytest.mark.parametrize(("kind", "path", "words"), [
     (Level, "hieght_m", "hieght_m: Level has no field 'hieght_m'; did you mean height_m?"),
     (Level, "cells", "cells: expected a number, a text or a truth value"),

@@ -387,6 +387,7 @@ def test_a_heartbeat_sent_before_the_order_proves_nothing_one_sent_after_it_does
 def test_a_new_life_that_dies_or_is_not_heard_is_asked_for_again(dies):
     rm = core()
     rm.event("a", "crashed", 3, "", 1.0)
+    rm.event("stranger", "crashed", 7, "", 1.0)
     rm.order(["a", "z"], 1.0, renewed=False)
     assert rm.problem.startswith("z: not among the nodes")
     rm.event("a", "respawned", 4, "", 1.1)

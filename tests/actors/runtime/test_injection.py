@@ -266,6 +266,7 @@ def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode,
 
 
 @pytest.mark.parametrize(("kind", "fields", "fits"), [
+    (LaserScan, {"set_fields": {"ranges_f32": b"1234"}}, True),
     (LaserScan, {"set_fields": {"ranges_f32": True}}, False),
     (Route, {"add_fields": {"step": 1.0}}, True),
     (Route, {"ramp_fields": {"step": 1.0}}, False),

@@ -69,6 +69,17 @@ REFUSED = {
     "$: an integer with thousands of digits": [("width_m = 0.614", "width_m = " + "9" * 5000)],
     "$.robot.top_speed_mps = 1e+200: expected 0, or 1e-09 to": [
         ("top_speed_mps = 1.0", "top_speed_mps = 1e200")],
+    "$.node[4]: required field 'name' is missing": [('name = "hmi"\n', "")],
+    "999...: 999999999 of 1 inputs; expected 1 to 1": [
+        ('detect = "DM3"', f'''detect = "{'9' * 5000} of (DM3)"''')],
+    "detection DM2: parameters.timeout_s = 1000": [
+        ('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
+    "mechanism FTM3: detect = 'DM9': unknown detection": [('detect = "DM3"', 'detect = "DM9"')],
+    "event moving_inside_prohibited_area: of[0] =": [
+        (PROHIBITED, PROHIBITED.replace("erroneous_graph", "bad_luck"))],
+    "$.order = 'braver': unknown order; known: safer": [('order = "safer" ', 'order = "braver" ')],
+    "detection DM5: parameters.watch[1] = 'telly': unknown": [
+        ('"hmi", "teleoperation"]', '"hmi", "telly"]')],
     "$: nested more than 32 deep": [("[layers]", f"[{'.'.join('a' * 50)}]")],
     "$.node[5].name = 'teleoperation': duplicate name,": [
         ('name = "hmi"', 'name = "teleoperation"')],
