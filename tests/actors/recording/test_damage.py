@@ -9,7 +9,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from rampart.actors.recording.bag_reader import BagReader
+from rampart.actors.recording.bag_reader import BagReader, repair
+from rampart.actors.recording.bag_writer import BagError
 from rampart.cli.main import main
 from tests.actors.recording.samples import foreign, sample, write
 
@@ -120,7 +121,12 @@ def test_verbs_report_bytes_and_seconds_that_are_gone_and_exit_with_1(tmp_path, 
         assert seconds in capsys.readouterr().out
     found, reader = contents(tmp_path / "whole.mcap")
     assert (0 < len(found) < len(everything), reader.gaps) == (True, [])
+    with (tmp_path / "whole.mcap").open("rb") as file:  # the independent reader
+        assert make_reader(file, validate_crcs=True).get_summary().statistics.message_count == len(
+            found)
     assert main(["bag", "info", str(tmp_path / "whole.mcap")]) == 0
+    with pytest.raises(BagError, match="is the file to repair"):
+        repair(reader, tmp_path / "whole.mcap", overwrite=True)
 
 
 @pytest.mark.parametrize("chunked", [True, False])

@@ -14,7 +14,7 @@ import random
 import struct
 import sys
 
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 
 RANGES = {"int8": (-128, 127), "uint8": (0, 255), "int16": (-2**15, 2**15 - 1),
           "uint16": (0, 2**16 - 1), "int32": (-2**31, 2**31 - 1), "uint32": (0, 2**32 - 1),
@@ -80,13 +80,7 @@ def plain(what):
 
 
 def main():
-    """Write messages; with "-" for the count read lines of type and bytes, and write them anew."""
-    if sys.argv[1] == "-":
-        for line in sys.stdin:
-            name, data = line.split()
-            made = class_of(name)
-            print(serialize_message(deserialize_message(bytes.fromhex(data), made)).hex())
-        return
+    """Write messages."""
     for name in sys.argv[2:]:
         dice, made = random.Random(name), class_of(name)
         for _ in range(int(sys.argv[1])):

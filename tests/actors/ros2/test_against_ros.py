@@ -10,16 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rampart.actors.ros2.translation.forms import READY
 from rampart.actors.ros2.translation.types import Types
 from tests import ROOT
 
 ROS = ROOT / ".venv-ros"
 PYTHON = ROS / "bin/python"
 ORACLE = Path(__file__).with_name("ros_oracle.py")
-MESSAGES = sorted({*READY, "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock",
-                   "std_msgs/msg/String", "action_msgs/msg/GoalStatusArray",
-                   "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path"})
 PARTS = ["std_srvs/srv/SetBool_Request", "std_srvs/srv/SetBool_Response",
          "std_srvs/srv/Trigger_Response", "lifecycle_msgs/srv/ChangeState_Request",
          "lifecycle_msgs/srv/ChangeState_Response", "action_msgs/srv/CancelGoal_Request",
@@ -29,8 +25,8 @@ KILTED = Types("kilted")
 pytestmark = pytest.mark.ros
 
 
-def asked(*arguments, said=None):
-    done = subprocess.run([PYTHON, ORACLE, *arguments], input=said, capture_output=True, text=True,
+def asked(*arguments):
+    done = subprocess.run([PYTHON, ORACLE, *arguments], capture_output=True, text=True,
                           check=False, timeout=120, env={**os.environ, "PYTHONPATH": ""})
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
@@ -49,7 +45,7 @@ def values(ours):
     return repr(ours) if isinstance(ours, float) else ours
 
 
-def without_padding(name, message, data, types=KILTED):
+def without_padding(name, message, data, types):
     """Return the bytes of a message without those between its fields, which ROS 2 leaves as is."""
     definition = types._store.get_msgdef(name)
     size = definition.getsize_cdr(0, message, types._store)
@@ -80,15 +76,6 @@ def test_random_messages_of_every_type_are_read_and_written_as_ros_2_does(each):
         count += 1
     assert count == each * len(names)
     assert max(tails) > 3
-    print(f"{count} messages of {len(names)} types, tails of up to {max(tails)} bytes")
-
-
-def test_ros_2_reads_what_we_write():
-    blanks = [(name, KILTED.blank(name)) for name in (*MESSAGES, *PARTS)]
-    said = "".join(f"{name} {KILTED.encode(name, blank).hex()}\n" for name, blank in blanks)
-    for (name, blank), back in zip(blanks, asked("-", said=said), strict=True):
-        assert without_padding(name, blank, bytes.fromhex(back)) == without_padding(
-            name, blank, KILTED.encode(name, blank)), name
 
 
 NOT_HERE = {"test_msgs/msg/WStrings",  # left out, and these are in IDL alone
@@ -96,23 +83,15 @@ NOT_HERE = {"test_msgs/msg/WStrings",  # left out, and these are in IDL alone
             "test_msgs/msg/KeyedString", "test_msgs/msg/NonKeyedWithNestedKey"}
 
 
-def test_all_hashes_are_the_official_ones(record_property):
+def test_all_hashes_are_the_official_ones():
     official = {}
     for file in ROS.glob("share/*/*/*.json"):
         for one in json.loads(file.read_text()).get("type_hashes", ()):
             official[one["type_name"]] = one["hash_string"]
-    packages = {name.split("/")[0] for name in official}
     folder = Types("kilted", [(ROS / "share").resolve()])
-    counts = {}
-    for what, types in (("as shipped", KILTED), ("of their files", folder)):
+    for types, most in ((KILTED, 170), (folder, 290)):
         there = official.keys() & types.known
         assert {name: types.hash(name) for name in there} == {
             name: official[name] for name in there}
-        counts[what] = len(there)
+        assert len(there) > most
     assert official.keys() - folder.known == NOT_HERE
-    assert len(official) > 300
-    assert counts["as shipped"] > 170
-    text = ", ".join(f"{count} {what}" for what, count in counts.items())
-    record_property("hashes", text)
-    print(f"official hashes of {len(packages)} packages: {len(official)}; equal: {text}; "
-          f"not read: {len(NOT_HERE)}")

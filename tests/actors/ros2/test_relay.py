@@ -171,7 +171,7 @@ def test_what_is_killed_comes_back_alone_and_a_rival_and_a_missing_node_are_repo
 
 REPORTED = REPORTS[REPORTS.index('[[ros2]]\nsubscribe = "/diagnostics"'):]
 for old, new in {"/navigate_to_pose": "/count", "nav/state": "count/state", "planner*": "rep*",
-                 "count = 3\nwithin_s = 1.0": "", ', suspects = ["gateway"]': ""}.items():
+                 ", count = 3, within_s = 1.0": "", ', suspects = ["gateway"]': ""}.items():
     assert old in REPORTED, old
     REPORTED = REPORTED.replace(old, new)
 

