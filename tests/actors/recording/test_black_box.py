@@ -106,6 +106,7 @@ def test_a_decision_keeps_the_time_before_and_after_it_in_a_recording(box):
     box.seconds(0, 100)
     box.second(100.0, decision(1, 100.5))
     box.seconds(101, 140)
+    (box.folder / "sample" / "20200101-000000-000.json").write_text('{"name": 1}')  # damaged
     [(incident, path)] = box.kept
     assert (incident.at_s, incident.run, incident.system) == (100.5, "sample", "paper")
     assert "FTM6" in incident.cause
@@ -121,7 +122,10 @@ def test_a_decision_keeps_the_time_before_and_after_it_in_a_recording(box):
     assert summary.counts.total() > 500
 
 
-def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):
+def test_a_healthy_run_the_end_of_a_fault_and_garbage_on_watched_keys_leave_nothing(box):
+    for number in range(100):
+        box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
+        box.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
     box.seconds(0, 20)
     box.second(20.0, decision(1, 20.5, active=()))
     box.seconds(21, 60)
@@ -273,22 +277,6 @@ def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
         box.second(141.0)
     assert [i.name for i, _ in incidents_in(box.folder)] == [newest]  # it may still be extended
     box.writer.abandon()
-
-
-def test_a_flood_of_garbage_on_watched_keys_begins_nothing(box):
-    for number in range(100):
-        box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
-        box.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
-    box.second(1.0)
-    box.writer.end()
-    assert incidents_in(box.folder) == []
-
-
-def test_a_damaged_description_hides_only_itself(box):
-    box.second(0.0, decision(1, 0.5))
-    box.seconds(1, 40)
-    (box.folder / "sample" / "20200101-000000-000.json").write_text('{"name": 1}')
-    assert len(incidents_in(box.folder)) == 1
 
 
 # -- the process ----------------------------------------------------------------------------

@@ -46,15 +46,6 @@ def test_the_gid_of_a_captured_attachment_is_that_of_the_captured_token():
     assert attachment.pack() == ATTACHED
 
 
-@pytest.mark.parametrize(("qos", "text"), [
-    (Qos(), "::,:,:,:,,"), (Qos(depth=10), "::,10:,:,:,,"),
-    (Qos(reliable=False, depth=1), "2::,1:,:,:,,"), (Qos(reliable=False, depth=7), "2::,7:,:,:,,"),
-    (Qos(transient_local=True, keep_all=True, depth=5), ":1:2,5:,:,:,,")])
-def test_quality_of_service_in_a_token(qos, text):
-    assert qos.token() == text
-    assert Qos.parse(text) == qos
-
-
 def test_nodes_in_namespaces_and_keys():
     node = Endpoint(7, "ab", "1", "1", EndpointKind.NODE, "amcl", "/robot/front")
     assert node.token == "@ros2_lv/7/ab/1/1/NN/%/%robot%front/amcl"
@@ -64,6 +55,9 @@ def test_nodes_in_namespaces_and_keys():
         "7/a/b/nav_msgs::msg::dds_::Path_/RIHS01_0")
     assert ros_name("std_srvs::srv::dds_::Trigger_") == "std_srvs/srv/Trigger"
     assert ros_name("what") == "what"
+    for qos, text in ((Qos(), "::,:,:,:,,"), (Qos(reliable=False, depth=7), "2::,7:,:,:,,"),
+                      (Qos(transient_local=True, keep_all=True, depth=5), ":1:2,5:,:,:,,")):
+        assert (qos.token(), Qos.parse(text)) == (text, qos)
 
 
 @pytest.mark.parametrize("token", [
