@@ -32,7 +32,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
-from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.actors.recording.process import Order, RecorderProcess, result_of
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
@@ -291,6 +291,7 @@ def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(po
     robot.connection.close()
     assert numbers(path) == []
     assert Summary(BagReader(path)).end["lost"] == '{"localization": 3}'
+    assert result_of(recorder) == f"recorded 6 messages in {path}, 3 lost"
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -287,6 +287,12 @@ async def test_a_service_is_called_and_its_answer_or_that_there_is_none_is_told(
             for heard in answers] == [
                 (True, True, "shut"), (True, False, "it has to be open")]
     assert base.shut == 2
+    refused, told = [], system.hear(DIAGNOSTIC, "base")
+    ask = gateway.node.client("/base/shut", "std_srvs/srv/SetBool")
+    ask(b"nonsense", 0.2, lambda answer, why: refused.append((answer, why)))
+    await asyncio.sleep(0.3)
+    assert refused == [(None, "no server answers")]
+    assert "begins with 6e 6f 6e 73" in told[0].message.reason
     await system.kill("base")
     asked(system, gateway, "base/shut", data=True)
     await asyncio.sleep(0.6)

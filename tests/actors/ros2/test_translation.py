@@ -298,6 +298,8 @@ def test_the_tail_of_a_message_that_was_serialized_beforehand_is_ignored_as_in_r
     assert (joint.name, joint.position.tolist(), len(joint.effort)) == (["a"], [1.0], 0)
     with pytest.raises(ValueError, match="JointState"):
         JAZZY.decode("sensor_msgs/msg/JointState", AS_RCLPY_SAYS[:-12])
+    with pytest.raises(ValueError, match="begins with 00 07 00 00; expected CDR"):
+        JAZZY.decode("sensor_msgs/msg/JointState", b"\0\7" + AS_RCLPY_SAYS[2:])
 
 
 def test_a_topic_of_any_type_has_the_defaults_of_ros_2_and_is_written_whole():
