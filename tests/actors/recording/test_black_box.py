@@ -126,6 +126,7 @@ def test_a_healthy_run_the_end_of_a_fault_and_garbage_on_watched_keys_leave_noth
     for number in range(100):
         box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
         box.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
+    box.writer.write([b"short"])
     box.seconds(0, 20)
     box.second(20.0, decision(1, 20.5, active=()))
     box.seconds(21, 60)
