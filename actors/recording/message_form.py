@@ -163,6 +163,12 @@ def _is_plain(kind: Any) -> bool:
 
 # -- schemas ---------------------------------------------------------------------------------------
 
+UNITS = {"m": "m", "mm": "mm", "s": "s", "ms": "ms", "us": "µs", "hz": "Hz", "kg": "kg", "n": "N",
+         "nm": "N m", "pa": "Pa", "j": "J", "w": "W", "v": "V", "a": "A", "lux": "lx",
+         "mps": "m/s", "mps2": "m/s²", "deg": "°", "rad": "rad", "radps": "rad/s",
+         "radps2": "rad/s²", "bytes": "B", "mb": "MB", "celsius": "°C", "percent": "%"}
+"""Last word of a field name → unit."""
+
 _SCHEMA_KEYS = ("title", "description", "enum", "contentEncoding", "required", "default")
 
 
@@ -170,7 +176,8 @@ def plain_schema(kind: Any) -> bytes:
     """Return the schema of a struct type for viewers: one object without references and unions.
 
     Viewers read a schema to find out what can be plotted. Many support only the basic parts of the
-    standard: `type`, `properties`, `items`, `enum`.
+    standard: `type`, `properties`, `items`, `enum`. A number whose field name ends in a unit
+    (`x_m`, `yaw_rad`) gets it as `unit`.
     """
     schema = msgspec.json.schema(kind)
     return msgspec.json.encode(_plain(schema, schema.get("$defs", {})))
@@ -187,7 +194,7 @@ def _plain(node: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         found["type"] = kind
     if kind == "object":
         found["properties"] = {
-            name: _plain(part, definitions)
+            name: _with_unit(name, _plain(part, definitions))
             for name, part in node.get("properties", {}).items()}
         if isinstance(node.get("additionalProperties"), dict):
             found["additionalProperties"] = _plain(node["additionalProperties"], definitions)
@@ -197,6 +204,13 @@ def _plain(node: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     elif kind is None and "enum" in node:
         found["type"] = "integer"
     return found
+
+
+def _with_unit(name: str, node: dict[str, Any]) -> dict[str, Any]:
+    _, _, word = name.rpartition("_")
+    kind = node.get("items", node).get("type")
+    has_unit = word != name and word in UNITS and kind in {"integer", "number"}
+    return {**node, "unit": UNITS[word]} if has_unit else node
 
 
 def _is_text(values: Any) -> bool:

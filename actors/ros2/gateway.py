@@ -234,8 +234,8 @@ class Gateway(Actor):
                 r.name: r.title for r in system.recoveries}
             self._diagnostics = Diagnostics(self.node, titles, system.name, self.time.ros_ns)
         self._side.tokens(f"{ADMIN}/{given.domain}/**", self._token)
-        for name, why in self._types.left_out.items():
-            self._note(name, why)
+        for name, note in self._types.notes.items():
+            self._note(name, note)
         self.call_later(run.system.timing.startup_grace_s, self._report_unpublished)
 
     def _start_relay(self) -> RelaySide:

@@ -17,7 +17,7 @@ from rampart.actors.bus.topic import Qos as BusQos
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import RosClock
-from rampart.actors.ros2.translation.mapping import Inward, Outward, message_of
+from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward, message_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import UNKNOWN_GID, Attachment, Qos, RosGraph
@@ -28,6 +28,8 @@ SILENT_S = 1.0
 
 _MISSED = 3
 """A publisher that has missed so many messages in a row is probably gone."""
+
+_ROUNDING = 0.999
 
 _ZEROS = 20
 """Messages of zeros that are published after the system has fallen silent."""
@@ -81,6 +83,8 @@ class Subscription:
         self._gateway, self._link, self._topic = gateway, link, topic
         self._decode = types.decoder(link.type)
         self._translate = Inward(link, types, topic.type, beside.type if beside else None)
+        self._period_s = 1 / link.rate_hz * _ROUNDING if link.rate_hz else 0.0
+        self._passed_s = -math.inf
         self._publisher = b""
         self._published_s = -math.inf
         self._gap_s = math.inf  # between the publisher's last two messages
@@ -104,12 +108,17 @@ class Subscription:
         try:
             if not self._is_new(attachment, now_s):
                 return
+            if now_s - self._passed_s < self._period_s:
+                return
             body, stamp_ns = self._translate(self._decode(payload), self._beside(now_s))
             stamp_s = (None if stamp_ns is None or link.stamp == "arrival"
                        else gateway.time.at_s(stamp_ns))
+        except NotMeantError:
+            return
         except ValueError as error:
             gateway.refuse(link.name, str(error))
             return
+        self._passed_s = now_s
         gateway.emit(self._topic, body, stamp_s)
 
     def _beside(self, now_s: float) -> Any:
@@ -167,6 +176,7 @@ class Publication:
     def __init__(self, gateway: Gateway, link: Ros2Link, topic: Topic[Any]) -> None:
         self._gateway, self._link = gateway, link
         self._translate = Outward(link, gateway.node.types, topic.type)
+        self._period_s = 1 / link.rate_hz * _ROUNDING if link.rate_hz else 0.0
         self._passed_s = -math.inf
         self._zeros = _ZEROS  # nothing has been published yet that zeros would cancel
         self._publish = gateway.node.publisher(
@@ -177,6 +187,8 @@ class Publication:
     def take(self, message: Any, header: Header) -> None:
         """Publish a message of the system, unless it is too old or cannot be translated."""
         gateway, link, now_s = self._gateway, self._link, self._gateway.clock.now()
+        if now_s - self._passed_s < self._period_s:
+            return
         age_s = now_s - header.stamp
         if age_s > link.max_age_s:
             gateway.refuse(link.name, f"message of {header.source} is {age_s:.3g} s old; expected "
@@ -232,7 +244,8 @@ def request_topic(link: Ros2Link, types: Types) -> Topic[Any]:
         ValueError: the type is not known.
     """
     part = _GOAL if link.way == "goal" else _REQUEST
-    return Topic(link.from_, message_of(f"{link.type}{part}", types), BusQos.COMMAND, 0.0, "",
+    made = message_of(msgspec.structs.replace(_part(link, part), fields={}), types)
+    return Topic(link.from_, made, BusQos.COMMAND, 0.0, "",
                  f"Requests to {link.name} of ROS 2, {link.type}.")
 
 
@@ -245,7 +258,7 @@ def answer_topic(link: Ros2Link, types: Types) -> Topic[Any]:
     if link.way == "goal":
         made: type[msgspec.Struct] = GoalState
     else:
-        response = message_of(f"{link.type}{_RESPONSE}", types)
+        response = message_of(_part(link, _RESPONSE, link.answer), types)
         made = msgspec.defstruct(
             "Answer", [("done", bool), ("why", Text, ""), *(
                 (f.name, f.type | None, None) for f in msgspec.structs.fields(response))],

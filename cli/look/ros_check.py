@@ -194,7 +194,7 @@ async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> 
                 found += [Finding("types", False, why) for why in there.side.problems]
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
             types = types_of(gateway.distribution, gateway.interfaces)
-            found += [Finding(kind, True, why) for kind, why in types.left_out.items()]
+            found += [Finding(kind, True, note) for kind, note in types.notes.items()]
             node = Endpoint(gateway.domain, "0", "0", "0", EndpointKind.NODE, gateway.node,
                             gateway.namespace)
             is_client = gateway.mode == "client"

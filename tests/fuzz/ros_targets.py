@@ -10,7 +10,7 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ros2.translation.forms import READY
-from rampart.actors.ros2.translation.mapping import Inward, topic_of
+from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError, topic_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import (
@@ -36,7 +36,8 @@ def types() -> Types:
 @cache
 def link(number: int) -> tuple[Topic[Any], str, Inward]:
     kind = _TYPES[number % len(_TYPES)]
-    table = Ros2Link(type=kind, subscribe="/heard", to="heard", datum=(43.6, 1.4))
+    frames = {"frame": "map", "child": "odom"} if kind == TF else {}
+    table = Ros2Link(type=kind, subscribe="/heard", to="heard", datum=(43.6, 1.4), **frames)
     topic = topic_of(table, types())
     return topic, kind, Inward(table, types(), topic.type)
 
@@ -47,7 +48,7 @@ def messages() -> Sequence[bytes]:
             for number, kind in enumerate(_TYPES)]
 
 
-@target("ros-message", refuses=(ValueError,), samples=messages)
+@target("ros-message", refuses=(ValueError, NotMeantError), samples=messages)
 def ros_message(data: bytes) -> None:
     """Bytes on a topic of ROS 2: refused in a line, or a message that all readers take."""
     topic, kind, made = link(data[0] if data else 0)

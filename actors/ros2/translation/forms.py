@@ -47,8 +47,11 @@ READY: Mapping[str, Mapping[str, str]] = {
     "sensor_msgs/msg/BatteryState": {
         "voltage_v": "voltage", "current_a": "current", "charge": "percentage"},
     "sensor_msgs/msg/Illuminance": {"illuminance_lux": "illuminance"},
+    "tf2_msgs/msg/TFMessage": {
+        "x_m": "transform.translation.x", "y_m": "transform.translation.y",
+        "yaw_rad": "yaw(transform.rotation)"},
 }
-"""Type → quantity → expression that reads it."""
+"""Type → quantity → expression that reads it; in a TFMessage from the transform of the link."""
 
 UNKNOWN: Mapping[str, Mapping[str, tuple[str, float]]] = {
     "sensor_msgs/msg/Imu": {

@@ -170,9 +170,15 @@ def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
 
 NS = 1_000_000_000
 
+TF = "tf2_msgs/msg/TFMessage"
+_TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _HEADER = "std_msgs/msg/Header"
 _F32 = "_f32"
 BESIDE = "beside."
+
+
+class NotMeantError(Exception):
+    """A message that the link does not concern, e.g. a transform of another frame."""
 
 
 class Inward:
@@ -192,7 +198,11 @@ class Inward:
                  beside: type[msgspec.Struct] | None = None) -> None:
         self._link = link
         self._made = made
-        fields = TypeFields(types, link.type)
+        self._picks = link.type == TF
+        read = _TRANSFORM if self._picks else link.type
+        if self._picks and not (link.frame and link.child):
+            raise ValueError("frame and child are missing: expected the frames of the transform")
+        fields = TypeFields(types, read)
         self.has_stamp = fields.kind("header") == _HEADER
         plane = Plane(link.datum) if link.datum else None
         ready = {**READY.get(link.type, reads_of(link.type, types)), **(
@@ -262,9 +272,12 @@ class Inward:
             beside: newest message of the link's `beside`.
 
         Raises:
+            NotMeantError: the link does not concern it.
             ValueError: a value is beyond the bounds of the message of the system, or the frame is
                 another one; one line.
         """
+        if self._picks:
+            message = self._picked(message)
         stamp_ns = None
         if self.has_stamp:
             header = message.header
@@ -283,6 +296,13 @@ class Inward:
             return msgspec.convert(found, self._made), stamp_ns
         except msgspec.ValidationError as error:
             raise ValueError(str(error).replace("`", "")) from None
+
+    def _picked(self, message: Any) -> Any:
+        for transform in message.transforms:
+            if (transform.header.frame_id.lstrip("/") == self._link.frame
+                    and transform.child_frame_id.lstrip("/") == self._link.child):
+                return transform
+        raise NotMeantError
 
 
 def _shown(value: Any) -> str:
@@ -319,12 +339,16 @@ class Outward:
     def __init__(self, link: Ros2Link, types: Types, source: type[msgspec.Struct], *,
                  lenient: bool = False) -> None:
         self._link, self._types = link, types
-        fields = TypeFields(types, link.type)
+        self._wraps = link.type == TF
+        self._name = _TRANSFORM if self._wraps else link.type
+        if self._wraps and not (link.frame and link.child):
+            raise ValueError("frame and child are missing: expected the frames of the transform")
+        fields = TypeFields(types, self._name)
         self._has_header = fields.kind("header") == _HEADER
         leaves = [path for path, _ in _leaves(source)]
         there = {path.rpartition(".")[2]: path for path in leaves}
         said: dict[str, str | float | bool] = {} if link.type in WRITTEN else {
-            path: path for path, read in reads_of(link.type, types).items()
+            path: path for path, read in reads_of(self._name, types).items()
             if path == read and path in leaves}
         for quantity, (where, text) in WRITTEN.get(link.type, {}).items():
             if quantity in there:
@@ -364,7 +388,7 @@ class Outward:
         Raises:
             ValueError: a value does not fit its field in ROS 2; one line.
         """
-        made = self._types.blank(self._link.type)
+        made = self._types.blank(self._name)
         for way, last, read in self._writes:
             inner = made
             for step in way:
@@ -378,7 +402,7 @@ class Outward:
 
     def zero(self, stamp_ns: int) -> bytes:
         """Return the encoded message with all fields 0."""
-        return self._finish(self._types.blank(self._link.type), stamp_ns)
+        return self._finish(self._types.blank(self._name), stamp_ns)
 
     def _finish(self, made: Any, stamp_ns: int) -> bytes:
         if self._has_header:
@@ -386,6 +410,10 @@ class Outward:
             made.header.frame_id = self._link.frame
         if hasattr(made, "child_frame_id"):
             made.child_frame_id = self._link.child
+        if self._wraps:
+            whole = self._types.blank(TF)
+            whole.transforms = [made]
+            made = whole
         return self._types.encode(self._link.type, made)
 
 
@@ -424,25 +452,52 @@ def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
         qos = Qos.COMMAND
     else:
         qos = Qos.STATE if link.transient_local else Qos.SENSOR
-    return Topic(link.to, message_of(link.type, types), qos, 0.0, link.frame,
+    return Topic(link.to, message_of(link, types), qos, link.rate_hz or 0.0, link.frame,
                  f"{link.name} of ROS 2, {link.type}.")
 
 
-def message_of(name: str, types: Types) -> type[msgspec.Struct]:
-    """Return a struct with the ready quantities of a type of ROS 2, else with its fields.
-
-    Raises:
-        ValueError: the type is not known.
-    """
-    if name not in READY:
-        return _mirrored(name, types, {})
-    fields: list[Any] = []
-    for quantity, text in READY[name].items():
-        kind = _BOUNDED[kind_of(quantity)]
-        fields.append((quantity, kind | None, None) if may_be_unknown(name, text)
-                      else (quantity, kind))
+def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
+    """Return the type of the messages of `topic_of`; raises as it does."""
+    ready = dict(READY.get(link.type, {}))
+    if link.datum and link.type == "sensor_msgs/msg/NavSatFix":
+        ready |= ON_PLANE
+    if not ready and not link.fields:
+        return _mirrored(link.type, types, {})
+    if link.type != TF:
+        fields = TypeFields(types, link.type)
+        plane = Plane(link.datum) if link.datum else None
+        kinds = {name: _python_type(said, fields, plane) for name, said in link.fields.items()}
+    else:
+        kinds = dict.fromkeys(link.fields, float)
+    for name in kinds:
+        if not name.isidentifier():
+            raise ValueError(f"fields: {name!r}: expected a name, e.g. speed_mps")
+    kinds = {name: kind_of(name) for name in ready} | kinds
+    made: list[Any] = []
+    for name, kind in kinds.items():
+        what: Any = _BOUNDED.get(kind, kind)
+        is_known = name in link.fields or not may_be_unknown(link.type, ready[name])
+        made.append((name, what) if is_known else (name, what | None, None))
     return msgspec.defstruct(
-        name.rpartition("/")[2], fields, bases=(Message,), frozen=True, kw_only=True)
+        link.type.rpartition("/")[2], made, bases=(Message,), frozen=True, kw_only=True)
+
+
+def _python_type(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> Any:
+    """Return the Python type of an expression's value."""
+    if not isinstance(said, str):
+        return type(said)
+    if said.startswith(BESIDE):
+        return float
+    expression = Expression(said, plane)
+    if not expression.paths:
+        return str
+    if said.strip() != expression.paths[0]:
+        return int if said.strip().startswith("count(") else float
+    kind = fields.kind(said.strip(), said)
+    found = _base(kind.removesuffix("[]"))
+    if found is None:
+        raise ValueError(f"fields: {said!r} is a {kind}; expected one of its fields")
+    return _listed(found) if kind.endswith("[]") else found
 
 
 def _listed(item: Any) -> Any:
@@ -451,7 +506,9 @@ def _listed(item: Any) -> Any:
     return Annotated[items, Meta(max_length=MOST)]
 
 
-def _base(kind: str) -> type:
+def _base(kind: str) -> type | None:
+    if kind.endswith("[]") or "/" in kind:
+        return None
     return {"string": str, "bool": bool}.get(kind, float if kind.startswith("float") else int)
 
 

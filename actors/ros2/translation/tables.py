@@ -50,18 +50,18 @@ class Ros2Link(Table, frozen=True, kw_only=True):
         goal: Action of ROS 2 that receives each message of `from` as its goal; the goal's state is
             on `to`.
         type: Type of the messages in ROS 2, or of the service or action.
-        to: Key of the topic of the system; if no class declares it, it gets the ready quantities
-            of `type`, else its fields.
+        to: Key of the topic of the system; if no class declares it, it gets the fields of `type`.
         from_: `from` in the file, in the same way; with `publish` a class has to declare it.
         fields: Field that is written → how it is read: a field of the other side, a number, a truth
             value, or a function of fields (`rampart.actors.ros2.translation.expressions`). Other
             fields follow the ready form of `type`.
         answer: The same for the answer of a call, on `to`.
         frame: Frame of messages to ROS 2, and required of messages from there; "" for any.
-        child: Child frame of messages to ROS 2 that have one.
+        child: Child frame of the transform that is meant, in a message of `tf`.
         beside: Key of a topic of the system whose newest message can be read too, as
             `beside.FIELD`, if it is not older than `max_age_s`.
         datum: Latitude and longitude, degrees, of the origin of `map`: for `east` and `north`.
+        rate_hz: Greatest number of messages per second; None for all.
         max_age_s: Older messages are not published to ROS 2, nor read as `beside`.
         stop_after_s: After so much silence of the system, zeros are published to ROS 2; None for
             never. Nothing stops the robot if the gateway is lost: a driver has to stop by itself
@@ -90,6 +90,7 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     child: str = ""
     beside: str = ""
     datum: tuple[float, float] | None = None
+    rate_hz: Positive | None = None
     max_age_s: Positive = 0.5
     stop_after_s: Positive | None = None
     within_s: Positive = 1.0

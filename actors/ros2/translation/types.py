@@ -86,6 +86,7 @@ class Types:
         self._hashes: dict[str, str] = {}
         self._services: set[str] = set()
         self._actions: set[str] = set()
+        self._replaced: list[str] = []
         self.left_out: dict[str, str] = {}
         for folder in (SHIPPED / "common", SHIPPED / distribution):
             self._read(folder)
@@ -97,6 +98,13 @@ class Types:
     def known(self) -> frozenset[str]:
         """Names of all messages, services and actions."""
         return frozenset((*self._store.fielddefs, *self._services, *self._actions))
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Types that the folders replace or leave out → one line about it."""
+        replaces = f"its definition replaces the one of {self.distribution}"
+        return dict.fromkeys(self._replaced, replaces) | {
+            name: f"left out: {why}" for name, why in self.left_out.items()}
 
     def fields(self, name: str) -> Fields:
         """Return the fields of a message, each with its type as `rosbags` describes it.
@@ -272,8 +280,10 @@ class Types:
         return found
 
     def _add(self, definitions: Mapping[str, tuple[Any, Fields]]) -> None:
-        for name in definitions:
+        for name, (_, fields) in definitions.items():
             if name in self._store.fielddefs:
+                if self._store.fielddefs[name][1] != _read_as_uint8(fields, "char", "byte"):
+                    self._replaced.append(name)
                 del self._store.fielddefs[name], self._store.types[name]
         self._described.fielddefs |= {
             name: (made, _read_as_uint8(fields, "char"))

@@ -260,7 +260,7 @@ def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_and_description
         [(schema, channel, message)] = make_reader(file).iter_messages()
     body = json.loads(schema.data)["properties"]["body"]
     assert body["description"] == "What it carries."
-    assert body["properties"]["mass_kg"] == {"type": "number"}
+    assert body["properties"]["mass_kg"] == {"type": "number", "unit": "kg"}
     assert (channel.metadata["about"], channel.metadata["frame"]) == (LOAD.doc, LOAD.frame)
     assert json.loads(message.data)["body"] == {"mass_kg": 20.0}
 

@@ -14,6 +14,7 @@ import pytest
 from rampart.actors.bus.topics import DIAGNOSTIC
 from rampart.actors.ros2.ros_nodes import GRAPH, RosGraphReport
 from rampart.actors.ros2.stand_in import StandIn
+from rampart.actors.ros2.translation.types import SHIPPED
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
@@ -110,9 +111,6 @@ async def loaded(text):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "guarded.toml")
         path.write_text(text)
-        wide = Path(folder, "interfaces/wide_msgs/msg/Wide.msg")
-        wide.parent.mkdir(parents=True)
-        wide.write_text("wstring text\n")
         async with VirtualSystem.load(path) as system:
             yield system
 
@@ -404,13 +402,13 @@ async def test_what_is_no_message_or_no_rotation_is_refused_counted_and_told_onc
     assert any("no attachment" in one.message.reason for one in told)
 
 
-@beside(base=configured(interfaces=["interfaces"]))
-async def test_a_definition_that_cannot_be_used_is_told_at_the_start(system):
+@beside(base=configured(interfaces=[str(SHIPPED / "humble")]))
+async def test_definitions_that_replace_others_are_told_at_the_start(system):
     told = system.hear(DIAGNOSTIC, "gateway")
     system.start_node("gateway")
     await asyncio.sleep(0.5)
-    assert [(one.message.offender, one.message.reason) for one in told] == [
-        ("wide_msgs/msg/Wide", "wide_msgs/msg/Wide has a wstring, which is not supported")]
+    words = {one.message.offender: one.message.reason for one in told}
+    assert "replaces the one of jazzy" in words["nav2_msgs/action/NavigateToPose_Result"]
 
 
 @beside(base=configured(clock="ros"))
