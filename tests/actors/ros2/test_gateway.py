@@ -171,6 +171,16 @@ async def test_messages_pass_both_ways_and_zeros_when_the_system_falls_silent(sy
     assert base.heard.count(0.0) == 20
 
 
+@beside(base=SYSTEM.replace("stop_after_s = 0.2", "rate_hz = 5").replace(
+    'frame = "odom"', 'frame = "odom"\nrate_hz = 5'))
+async def test_a_table_passes_at_most_its_rate(system):
+    _, odometry, _ = watched(system)
+    base, _ = start(system, "base", "driver")
+    await asyncio.sleep(2.0)
+    assert len(base.heard) == pytest.approx(10, abs=1)
+    assert len(odometry) == pytest.approx(10, abs=1)
+
+
 @beside()
 async def test_at_an_orderly_end_ros_2_gets_one_last_zero(system):
     base, *_ = start(system, "base", "gateway", "driver")
