@@ -8,11 +8,13 @@ from contextlib import asynccontextmanager
 import pytest
 
 from rampart.actors.operator.panels import Panel
+from rampart.testing import eventually
 from tests.actors.operator.browser import mouse
 from tests.actors.operator.page import LIVE, page, show
-from tests.actors.operator.test_panels import PANELS, Speaks, hmi
+from tests.actors.operator.test_page_operating import key
+from tests.actors.operator.test_panels import AT_REST, DRIVE, PANELS, Speaks, driven, hmi, rests
 from tests.actors.operator.world import repeated
-from tests.tank import LEVEL, PUMP, VALVE, Level, Phase, Pump, Valve
+from tests.tank import LEVEL, PUMP, VALVE, Hand, Level, Phase, Pump, Valve
 
 pytestmark = pytest.mark.page
 
@@ -185,3 +187,40 @@ async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_
         await mouse(tab, "mouseReleased", x, y)
         assert await tab.value(f"{fold}.closest('.panel').open") is False
         await tab.until(f"{where} !== {json.dumps(before)} && {OVERLAPS} === ''", 5)
+
+
+# -- Several declared sticks in a real Chromium --
+
+
+LIFT = Panel(title="Lift", stick=("tank/level:height_m",), scale=(3.0,))
+
+
+def of(panel: str, part: str) -> str:
+    return f"$('[data-name=\"{panel}\"] {part}')"
+
+
+def state(panel: str = "Drive") -> str:
+    return f"{of(panel, '.stick-state')}.textContent"
+
+
+@pytest.mark.usefixtures("patient")
+async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_s(world, tab):
+    async with driven(world, DRIVE, LIFT) as (robot, hmi, _):
+        await show(tab, hmi)
+        await tab.until(f"{state()} === 'free'")
+        await tab.value(f"{of('Lift', '.stick')}.focus()")
+        await key(tab, "a", down=True)
+        await rests(robot)
+        assert await tab.value(state("Lift")) == "free"  # it has no such direction
+        await key(tab, "w", down=True)
+        await tab.until(f"{state('Lift')} === 'you drive'")
+        assert robot.hands == [AT_REST]
+        await key(tab, "w", down=False)
+        await tab.value(
+            "navigator.getGamepads = () => [{connected: true, axes: [0, -1], buttons:"
+            " Array.from({length: 8}, (_, i) => ({pressed: window.held && i === 4}))}];"
+            "dispatchEvent(new Event('gamepadconnected')); window.held = true")
+        await eventually(lambda: robot.hands[-1] == Hand(0.25, 0.0, True))
+        assert await tab.value(state("Lift")) == "free"
+        await tab.value("window.held = false")
+        await rests(robot)
