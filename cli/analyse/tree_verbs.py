@@ -34,6 +34,7 @@ from rampart.manager.drawing.diagram import WHATS, Box, Diagram, draw
 from rampart.manager.spec.schema import SystemSpec
 
 ABOVE = "↑"
+_LIMIT = 100
 
 
 def to_text(diagrams: Sequence[Diagram]) -> str:
@@ -120,9 +121,6 @@ def show_tree(options: argparse.Namespace) -> int:
                          "set PYTHONUTF8=1") from None
     say_text(text.rstrip("\n"))
     return 0
-
-
-_LIMIT = 100
 
 
 def cut_sets(options: argparse.Namespace) -> int:
