@@ -101,6 +101,7 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "wrong-graph", "--duration", "-1"], ["--duration -1"]),
     (["inject", "drop:detection/*"], ["no topic"]),
     (["inject", "kill:pump"], ["kill:pump: only from the start of a run, by --fault", "kill-node"]),
+    (["topic", "info", "?"], ["unknown topic '?'; none of ", "is similar"]),
     (["topic", "info", "plan/rout"], ["'plan/rout'", "the nearest of", "plan/route"]),
     (["topic", "echo", "localization/pose/x"], ["no run found"]),
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
