@@ -40,6 +40,15 @@ def test_a_respawned_hmi_sends_the_first_mission_only_at_the_start(incarnation, 
     assert (submission.pending is not None) is sends
 
 
+def test_the_first_mission_is_settled_when_the_mission_manager_has_another_one():
+    submission = Submission("r7", 2, RESPAWN_WINDOW_S / 2, FIRST)
+    submission.hear(status(MissionRequest("r7/1.1", "B", GOALS), MissionPhase.CANCELLED))
+    assert submission.pending is None
+    submission.ask("A", GOALS, 10.0)
+    submission.hear(status(FIRST, MissionPhase.CANCELLED))
+    assert submission.pending is not None, "later ones are settled by their own id alone"
+
+
 def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
     ids = set()
     for incarnation in (1, 2):

@@ -140,6 +140,13 @@ def test_an_order_is_obeyed_or_refused_with_a_reason(situation, action, expected
         assert ms.status(after) == ms.status(state), "a refused order changes nothing"
 
 
+def test_the_same_order_again_is_the_same_order_also_when_it_would_be_refused_now():
+    once, first = ms.obey(situations()["running"], order(A.SKIP), 15.0)
+    assert ms.obey(once, order(A.SKIP), 16.0) == (once, first)
+    over, refused = ms.obey(MissionState(), order(A.PAUSE), 1.0)
+    assert ms.obey(over, order(A.PAUSE), 2.0) == (over, refused)
+
+
 def test_while_a_recovery_holds_the_robot_the_mission_is_paused_with_its_reason():
     held = ms.hold(running(), "held by RM2: DM2: command not updated")
     assert ms.status(held).phase is MissionPhase.PAUSED
