@@ -14,6 +14,7 @@ from rampart.actors.access import key_folder
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests.actors.access.keyed import layout_of, make_keys
+from tests.real_tools import connections
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
@@ -44,9 +45,7 @@ def test_tools_may_what_their_certificate_says_and_a_module_whose_own_expires_st
     inject = ("inject", "drop:localization/pose", "--duration", "0.1")
     with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
         run.wait_for("goal 1/3", 60)
-        pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
-        assert {c.laddr for pid in pids for c in psutil.Process(pid).net_connections("inet")
-                if c.status == psutil.CONN_LISTEN} == {
+        assert {one.laddr for one in connections(run) if one.status == psutil.CONN_LISTEN} == {
             ("127.0.0.1", port) for port in run.info.ports}
         for words, shown, code, why in (
                 (inject, None, 0, ""), (("status",), "bob", 0, ""),

@@ -146,16 +146,15 @@ def test_what_does_not_fit_a_system_without_a_robot_is_refused(old, new, message
 
 @pytest.mark.processes
 def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_from(tmp_path):
-    with RealRun(tmp_path, str(FILE), "--duration", "40") as run:
+    with RealRun(tmp_path, str(FILE), "--duration", "120") as run:
         run.wait_for("ctrl-C ends it")
         run.sleep_until(1.0)
         run.kill("arm_controller")
         run.wait_for("(R_RESTART_MOTION): ")
         run.wait_for("arm_controller respawned")
         first = subprocess.Popen([sys.executable, "-m", "rampart.cli.main", "trigger",
-                                  "D_ENCODER_B",
-                                  "--for", "4", "--port", str(run.port)], cwd=ROOT,
-                                 stdout=subprocess.DEVNULL)
+                                  "D_ENCODER_B", "--for", "90", "--port", str(run.port)],
+                                 cwd=ROOT, stdout=subprocess.DEVNULL)
         try:
             run.wait_for("(D_ENCODER_B): triggered by hand")
             time.sleep(0.3)
@@ -164,7 +163,8 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
             assert done.returncode == 0, done.stderr
             assert "(R_HOLD): " in run.story
         finally:
-            first.wait(20)
+            first.kill()
+            first.wait()
         assert run.tool("trigger", "gripper").returncode == 2
         run.process.send_signal(signal.SIGINT)
         code, result = run.result(20)

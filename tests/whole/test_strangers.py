@@ -7,13 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import psutil
 import pytest
 
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests.other_user import NOBODY, needs_root
+from tests.real_tools import connections
 from tests.whole.missions import write_mission
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, needs_root]
@@ -64,8 +63,7 @@ def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
         for address, outcomes in found["knocked"].items():
             assert "answered" not in outcomes, address
             assert address not in named or set(outcomes) == {"PermissionError"}, address
-        pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
-        assert [c for pid in pids for c in psutil.Process(pid).net_connections("inet")] == []
+        assert connections(run) == []
         assert run.process.poll() is None
         assert "payload rejected" not in run.story
         assert "crashed" not in run.story

@@ -291,6 +291,11 @@ def test_one_that_says_that_it_ends_has_to_end():
         pulse.beat()
         after += wells(pulse, n)
     assert after[:5] + after[-1:] == [True] * 5 + [False]
+    pulse.restart()
+    pulse.beat()
+    assert all(wells(pulse, *range(10, 15))), "the next one has not said so"
+    pulse.beat()
+    assert all(wells(pulse, *range(15, 20)))
 
 
 @pytest.mark.parametrize(("text", "seconds"), [
