@@ -1,7 +1,5 @@
 """A robot with topics of its own: the shipped one that carries something, in a spec and actors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -35,8 +35,6 @@ processes begin as copies of the root, and what they share with it becomes their
 it.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Missions that are short enough for a test, on the shipped airport; and a disk that is full."""
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Callable
 from pathlib import Path

@@ -6,8 +6,6 @@ hands it on to the host it is for, later or not at all. It takes the privileges 
 `why_not` says whether there are.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import heapq

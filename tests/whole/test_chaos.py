@@ -1,7 +1,5 @@
 """Short chaos, which every change has to survive; `make chaos` and `make soak` are longer."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Commands as nodes, on real processes: killed, stopped, hung, flooding, forking, gone at once."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -5,8 +5,6 @@ unsafe. So what is shown is the layer's doing and not the fault's harmlessness. 
 virtual time, on the paper's system and on the full one.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """A system that runs out of something, or has a member that takes too much, or nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

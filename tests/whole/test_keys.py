@@ -1,7 +1,5 @@
 """Whole runs with keys: missions with nodes and routers killed, tools, strangers, rotation."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The product's main job on real parts: processes, Zenoh, MuJoCo, `launch.py` from the shell."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

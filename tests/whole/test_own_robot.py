@@ -1,7 +1,5 @@
 """Robots of one's own: what a run says of their modules and of what they have not; a cell runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A run whose launcher is killed goes on where it was: on real processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

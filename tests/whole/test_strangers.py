@@ -1,7 +1,5 @@
 """Another user of the machine: nothing in, nothing out, on every port and socket of a run."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """One system on two machines: network namespaces, joined by a line that may be bad, or cut."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

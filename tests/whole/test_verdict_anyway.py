@@ -1,7 +1,5 @@
 """Verdict, result and exit code of a run depend on no disk, no terminal and no reader."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Whole missions in virtual time: deterministic to the byte, and the same as on processes."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A router with keys in the process of a test, sessions by any certificate, what they achieve."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Iterable

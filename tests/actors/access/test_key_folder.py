@@ -1,7 +1,5 @@
 """A folder of keys: what is made, who may read it, and what is left when its maker is killed."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime as dt
 import os

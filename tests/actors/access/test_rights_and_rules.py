@@ -1,7 +1,5 @@
 """Who may what, computed from classes, and what follows for routers."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart.actors.access.register import Register

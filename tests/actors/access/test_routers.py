@@ -1,7 +1,5 @@
 """Routers with keys, over real TLS: an identity gets what it declares, and a stranger nothing."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import os

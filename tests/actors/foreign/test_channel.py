@@ -1,7 +1,5 @@
 """The socket of a command: what passes in either direction, and what is refused."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

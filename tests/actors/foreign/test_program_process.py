@@ -1,7 +1,5 @@
 """A program as the process of its node holds it: started, heard, ended, and what it has forked."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import os

@@ -1,7 +1,5 @@
 """Two hosts hold the newest states of shared nodes, in messages and files, whatever happens."""
 
-from __future__ import annotations
-
 import errno
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Rendezvous of the launchers: readiness, equal files, the end of the run."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import re

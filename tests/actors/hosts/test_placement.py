@@ -1,7 +1,5 @@
 """Placement as hosts are lost and return, never two of a node; how far their clocks are apart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """Who hangs and who merely waits for a processor, who was absent, and what each uses."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

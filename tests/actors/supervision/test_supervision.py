@@ -1,7 +1,5 @@
 """Real processes, really killed: what root and supervisor promise whatever the nodes do."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ctypes

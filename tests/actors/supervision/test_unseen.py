@@ -1,7 +1,5 @@
 """Whatever fails on an event loop is told; a run of which a part fails ends in order, with why."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import os

@@ -1,7 +1,5 @@
 """The root feeds device and systemd while supervisor and manager work, and not otherwise."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
