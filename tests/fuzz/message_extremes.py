@@ -58,11 +58,13 @@ def pack(source: str, incarnation: int, sequence: int, stamp: float, body: Plain
 # -- small values ----------------------------------------------------------------------------------
 
 
-def filled(kind: inspect.Type, text: str = "", number: int = 0, items: int = 1) -> Plain:  # noqa: PLR0911 a return for each kind of type
-    """Return a value of a type from one text and one number, with so many items in collections."""
+def filled(  # noqa: PLR0911 a return for each kind of type
+        kind: inspect.Type, text: str = "", number: int = 0, items: int = 1, array: bytes = b"",
+        ) -> Plain:
+    """Return a value of a type from a text, a number and an array; collections have `items`."""
 
     def inner(part: inspect.Type) -> Plain:
-        return filled(part, text, number, items)
+        return filled(part, text, number, items, array)
 
     match kind:
         case inspect.IntType() | inspect.FloatType():
@@ -73,7 +75,7 @@ def filled(kind: inspect.Type, text: str = "", number: int = 0, items: int = 1) 
         case inspect.StrType():
             return text[:kind.max_length]
         case inspect.BytesType():
-            return b""
+            return array
         case inspect.BoolType():
             return number > 0
         case inspect.EnumType():

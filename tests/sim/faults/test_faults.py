@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec import inspect
 
-from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.messages import Injection, Message
 from rampart.actors.bus.topic import Topic
@@ -36,6 +36,7 @@ from rampart.sim.faults.topic_faults import (
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, OsmosisFaults
 from tests import TANK
+from tests.fuzz.message_extremes import filled
 from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
 
@@ -52,26 +53,11 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     return topic_fault_of(mode, key, seed, topics.ALL, OsmosisFaults.sizes)
 
 
-SIMPLE = {
-    float: lambda n: 0.25 * n,
-    int: lambda n: 10 + n,
-    bool: lambda n: n % 2 == 0,
-    str: lambda n: f"text {n}",
-    bytes: lambda n: np.array([1.0 + n, 2.0 + n, 3.0 + n], dtype="<f4").tobytes(),
-}
-
-
 def sample(kind: Any, n: int) -> Any:
-    """Return a value of a type; another one for each n, as a node that lives would publish."""
-    kind = bare(kind)
-    if kind in SIMPLE:
-        return SIMPLE[kind](n)
-    if getattr(kind, "__origin__", None) is tuple:
-        count = 3 if kind.__args__[-1] is Ellipsis else len(kind.__args__)
-        return tuple(sample(kind.__args__[0], n + i) for i in range(count))
-    if issubclass(kind, msgspec.Struct):
-        return kind(*(sample(f.type, n) for f in msgspec.structs.fields(kind)))
-    return list(kind)[n % len(kind)]
+    """Return a message of a type; another one for each n, as a node that lives would publish."""
+    array = np.array([1.0 + n, 2.0 + n, 3.0 + n], dtype="<f4").tobytes()
+    return msgspec.convert(filled(inspect.type_info(kind), f"text {n}", 10 + n, 3, array), kind,
+                           builtin_types=(bytes,), strict=False)
 
 
 class Publisher:
