@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
+from rampart.sim.campaign.job import DecisionTaken, Job
 from rampart.sim.campaign.report import (
     Campaign,
     headline,
@@ -27,6 +27,7 @@ from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.paper_tables import Decided, section
+from tests.sim.campaign.test_campaign import result
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
 OUT = Path("out/my campaign")
@@ -38,15 +39,10 @@ def run(fault: str = "gps-bias", *, row: str = "", affected: int = 1, ftm: bool 
     planned = (PlannedFault(fault, 12.0),) if fault else ()
     job = Job(row=row or fault or "none", faults=planned, ftm=ftm, options={"obstacles": obstacles},
               strategy=strategy, seed=seed, retuned=retuned or {})
-    fields = {
-        "success": True, "safe": True, "reasons": (), "duration_s": 90.0,
-        "margins": {"obstacle_m": obstacle_m, "prohibited_m": prohibited_m}, "severity": 0.0,
-        "unsafe_s": None,
+    return Run(job, result(**{
+        "duration_s": 90.0, "margins": {"obstacle_m": obstacle_m, "prohibited_m": prohibited_m},
         "injected_s": 12.0 if planned else None, "detected_after_s": None,
-        "recovered_after_s": None, "false_alarms": 0, "decisions": (),
-        "outcomes": tuple(FaultOutcome(p.text(), 12.0, affected) for p in planned),
-        "failures": (), "trace": "t", "wall_s": 1.0} | more
-    return Run(job, RunResult(**fields))
+        "outcomes": tuple(FaultOutcome(p.text(), 12.0, affected) for p in planned)} | more))
 
 
 def paper_page(runs: list[Run], decided: Sequence[Decided] = ()) -> str:
