@@ -234,6 +234,15 @@ def test_a_message_that_leaves_as_it_came_is_not_affected(mode, fields, affected
     assert faults.expire("i") == affected
 
 
+def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
+    faults = gate("drop")
+    sent(faults, [11.0, 12.0])
+    assert faults.order(Injection("i", "localization/pose", "duplicate", 5.0), 12.0) == ""
+    assert sent(faults, [13.0]) == [(13.0, 13.0, 0.0, 2)]
+    assert faults.expire("i") == 3
+    assert faults.expire("i") == 0
+
+
 # -- what is refused -----------------------------------------------------------------------------
 
 
