@@ -9,6 +9,8 @@ import uuid
 from collections.abc import Coroutine, Sequence
 from typing import Any
 
+import msgspec
+
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
@@ -37,7 +39,7 @@ from rampart.sim.faults.topic_faults import Disturbance, Fault, modes_of, system
 
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
-_OF_TOPICS = ("share", "on", "off", "seed", "add", "ramp", "noise")
+_OF_TOPICS = ("share", "on", "off", "seed", "set", "add", "ramp", "noise")
 """Options of a fault of a topic."""
 
 _TAKE_HOLD_S = 1.5
@@ -61,8 +63,10 @@ def add(verbs: Any) -> None:
               "and corrupt:TOPIC (default: 0)"),
         number("--on", "S", "with --off: in force for S, repeatedly"),
         number("--off", "S", "with --on: then absent for S"),
+        several("--set", "FIELD=VALUE", "corrupt:TOPIC: overwrite a field; repeatable, as all "
+                "below"),
         several("--add", "FIELD=BIAS", "corrupt:TOPIC: add BIAS to a number, or to each number of "
-                "an array; repeatable, as all below"),
+                "an array"),
         several("--ramp", "FIELD=RATE", "corrupt:TOPIC: add RATE per simulated second"),
         several("--noise", "FIELD=SIGMA", "corrupt:TOPIC: add Gaussian noise of this standard "
                 "deviation"),
@@ -83,6 +87,7 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
       rampart inject FAULT --duration 3
       rampart inject stuck:TOPIC --duration inf       # until the node's process ends
       rampart inject corrupt:TOPIC --seed 7           # odd seed: one number; even: all
+      rampart inject corrupt:TOPIC --set pose.x_m=2.5
       rampart inject corrupt:TOPIC --ramp pose.x_m=0.5
       rampart inject trigger:MODULE                   # a stand-in detection module detects
 
@@ -149,9 +154,9 @@ def choose(options: argparse.Namespace) -> Fault:
         positive(name, value, "must be seconds above 0", math.inf)
     mode, colon, key = options.fault.partition(":")
     known = topics_for(key, options.port) if colon else ()
-    if options.add or options.ramp or options.noise:
+    if options.set or options.add or options.ramp or options.noise:
         if mode != "corrupt":
-            raise UsageError(f"--add, --ramp, --noise: only with corrupt:TOPIC, not with "
+            raise UsageError(f"--set, --add, --ramp, --noise: only with corrupt:TOPIC, not with "
                              f"{options.fault}")
         fault = _corruption(*resolve(key, known), options)
     else:
@@ -163,11 +168,22 @@ def choose(options: argparse.Namespace) -> Fault:
 def _corruption(topic: Topic[Any], key: str, options: argparse.Namespace) -> Fault:
     change = Disturbance(
         key.removeprefix(f"{ROOT}/"), "corrupt", seed=options.seed or 0,
+        set_fields=dict(_setting(text) for text in options.set),
         add_fields=_amounts("--add", options.add), ramp_fields=_amounts("--ramp", options.ramp),
         noise_fields=_amounts("--noise", options.noise))
     if reason := flaw(change.order("", _DEFAULT_DURATION_S), topic.type):
         raise UsageError(f"{options.fault}: {reason}")
     return Fault(f"corrupt:{change.topic}", "", (change,), (), _DEFAULT_DURATION_S)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise UsageError(f"--set {text}: expected FIELD=VALUE")
+    try:
+        return name, msgspec.json.decode(value)
+    except msgspec.DecodeError:
+        return name, value
 
 
 def _amounts(option: str, texts: Sequence[str]) -> dict[str, float]:

@@ -93,6 +93,8 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "wrong-graph", "--on", "1", "--off", "inf"], ["--off inf"]),
     (["inject", "corrupt:localization/pose", "--add", "z_m=1"], ["'z_m'", "x_m, y_m, yaw_rad"]),
     (["inject", "corrupt:plan/route", "--ramp", "step=up"], ["--ramp step=up: expected FIELD"]),
+    (["inject", "corrupt:plan/route", "--set", "step"], ["--set step: expected FIELD=VALUE"]),
+    (["inject", "corrupt:localization/pose", "--set", "x_m=far"], ["'x_m' = 'far'"]),
     (["inject", "corrupt:localization/pose", "--noise", "x_m=-1"], ["'x_m' = -1", "0 or more"]),
     (["inject", "obstacle-ahead"], ["--fault obstacle-ahead@"]),
     (["inject", "weak-wheel:nose"], ["unknown wheel 'nose'; known: front-left"]),
@@ -141,8 +143,9 @@ def test_the_catalogue_is_listed_with_who_should_see_each_fault(capsys):
     (["corrupt:summit_xl/scan", "--add", "ranges_f32=0.4", "--noise", "ranges_f32=0.2", "--seed",
       "3"], {"topic": "summit_xl/scan", "mode": "corrupt", "duration_s": 4.0, "seed": 3,
              "add_fields": {"ranges_f32": 0.4}, "noise_fields": {"ranges_f32": 0.2}}),
-    (["corrupt:rampart/summit_xl/odom", "--ramp", "pose.x_m=0.5"], {
-        "topic": "summit_xl/odom", "ramp_fields": {"pose.x_m": 0.5}}),
+    (["corrupt:rampart/summit_xl/odom", "--set", "pose.y_m=2", "--ramp", "pose.x_m=0.5"], {
+        "topic": "summit_xl/odom", "set_fields": {"pose.y_m": 2},
+        "ramp_fields": {"pose.x_m": 0.5}}),
 ])
 def test_a_fault_is_put_together_from_options(arguments, order):
     (made,) = choose(build_parser().parse_args(["inject", *arguments])).orders("i1", 4.0)
