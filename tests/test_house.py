@@ -157,6 +157,27 @@ def test_the_map_of_the_house_names_every_room():
         ".".join(m.split(".")[:2]) for m in MODULES if is_robot(m)}
 
 
+def test_the_arrows_of_the_map_are_the_imports():
+    source = (ROOT / "docs/images/rooms.mmd").read_text(encoding="utf-8")
+    boxes = {room: box
+             for box, label in re.findall(r'^  (\w+)\(?\["(.*)"\]', source, re.MULTILINE)
+             for room in named(label.replace("<br>", " "))}
+    assert set(boxes) >= set(ROOMS)
+    drawn = set(re.findall(r"^  (\w+) --> (\w+)$", source, re.MULTILINE))
+
+    def box_of(module: str) -> str | None:
+        room = ".".join(module.split(".")[:2]) if is_robot(module) else room_of(module)
+        return boxes.get(room)  # the package of several rooms is in none
+
+    between_boxes = {(box_of(module), box_of(imported)) for module, imported in imports()
+                     if is_robot(module) or not is_robot(imported)}
+    reached = set(drawn)
+    for between in set(boxes.values()):
+        reached |= {(a, d) for a, b in reached for c, d in reached if b == between == c}
+    assert drawn <= between_boxes
+    assert {(a, b) for a, b in between_boxes if a != b and None not in {a, b}} <= reached
+
+
 def test_a_room_has_one_name_only():
     """From a checkout Python finds the folders, too."""
     for name in ("actors", "cli", "files", "manager", "sim", "systems"):
