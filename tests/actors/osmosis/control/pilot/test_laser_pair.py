@@ -95,6 +95,20 @@ def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
     assert not len(bench.view.points)
 
 
+@pytest.mark.parametrize("other", [
+    LaserScan(-0.3, 0.1, TOP_M, np.full(7, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.05, TOP_M, np.full(9, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.1, 6.0, np.full(5, 4, "<f4").tobytes(), 0.1001)])
+@pytest.mark.parametrize("first", [LOWER, UPPER])
+def test_of_lasers_that_differ_in_their_rays_all_echoes_count(first, other):
+    bench = Bench()
+    bench.feed(first, other, 0.0)
+    bench.feed(1 - first, healthy(1), 0.0)
+    bench.feed(first, msgspec.structs.replace(other, reference_m=0.1002), PERIOD_S)
+    assert set(distances(bench.view)) == {3.0, 4.0}
+    assert len(bench.view.points) == 1 + len(other.ranges_f32) // 4
+
+
 LACKING = {
     "empty": {"ranges_f32": b""}, "torn": {"ranges_f32": healthy(1).ranges_f32[:-1]},
     "few rays": {"ranges_f32": healthy(1).ranges_f32[:8]}, "near": {"range_max_m": 0.3},

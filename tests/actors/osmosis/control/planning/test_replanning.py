@@ -153,8 +153,9 @@ def passes(route, place):
 async def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough(system):
     planned = Planned(system, replan_after_s=16.0)
     await planned.begin()
-    await planned.blocked(*CRATE, for_s=15.0)
-    assert len(planned.routes) == 1
+    for wrong in ({"for_s": 15.0}, {"step": 1}, {"mission": "m2"}):
+        await planned.blocked(*CRATE, **wrong)
+        assert len(planned.routes) == 1
     await planned.blocked(*CRATE, for_s=16.5)
     direct, detour = planned.routes
     assert passes(direct, CRATE)
@@ -170,11 +171,10 @@ async def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enoug
 
 
 @in_system(airport=AIRPORT)
-async def test_without_another_way_and_after_reports_of_something_else_the_route_stays(system):
+async def test_without_another_way_and_after_a_report_of_no_place_the_route_stays(system):
     planned = Planned(system, replan_after_s=16.0, avoid_gap_m=30.0)
     await planned.begin()
-    for mission, step, x_m in (("m2", 0, CRATE[0]), ("m1", 1, CRATE[0]), ("m1", 0, math.nan)):
-        await planned.blocked(x_m, CRATE[1], step=step, mission=mission, for_s=99.0)
+    await planned.blocked(math.nan, CRATE[1])
     await planned.order(step=1, goal=m.Goal(-29.4, -3.3, Mode.TAXI))
     await planned.blocked(-29.4, -3.3, step=1)
     assert [route.step for route in planned.routes] == [0, 1]
