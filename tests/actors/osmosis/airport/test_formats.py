@@ -111,6 +111,7 @@ def test_our_own_format_gives_lights_missions_obstacles_and_pavement(tmp_path):
     ("T = [30.0, 0.0]", "T = [30.0, 20.0]", "in the prohibited area; expected on the pavement"),
     ("T = [30.0, 0.0]", "S = [30.0, 0.0]", "file: not valid TOML: "),
     ("half_width_m = 3.0", "half_width_m = -3.0", "half_width_m: -3.0: expected a number > 0"),
+    ("radius_m = 0.4", "radius_m = 9.0", "obstacle[0].radius_m: 9.0: "),
     ("half_width_m = 3.0", "", "surface[0].half_width_m: None: missing beside centre_line"),
     ("half_width_m = 3.0", "half_widht_m = 3.0", "surface[0].half_widht_m: 3.0: unknown field"),
     ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9],[9,0],[0,9]]",

@@ -74,8 +74,10 @@ def test_no_route_fails_the_mission_with_the_planners_reason():
     assert ms.routed(state, msgspec.structs.replace(none, active=False)) is state
     found = msgspec.structs.replace(none, waypoints=((0.0, 0.0),), reason="way round")
     assert ms.routed(state, found).phase is MissionPhase.RUNNING
+    home = situations()["returning"]
+    assert ms.routed(home, msgspec.structs.replace(found, step=2)) == home
     for before, route, reason in ((state, none, "goal 1: no way"), (
-            situations()["returning"], msgspec.structs.replace(none, step=2), "home: no way")):
+            home, msgspec.structs.replace(none, step=2), "home: no way")):
         failed = ms.routed(before, route)
         assert (failed.phase, failed.reason) == (MissionPhase.FAILED, reason)
 
@@ -143,6 +145,8 @@ def test_an_order_is_obeyed_or_refused_with_a_reason(situation, action, expected
 def test_the_same_order_again_is_the_same_order_also_when_it_would_be_refused_now():
     once, first = ms.obey(situations()["running"], order(A.SKIP), 15.0)
     assert ms.obey(once, order(A.SKIP), 16.0) == (once, first)
+    later = ms.accept(once, m.MissionRequest("id-2", "B", GOALS), 17.0)
+    assert ms.obey(later, order(A.SKIP), 18.0) == (later, first)
     over, refused = ms.obey(MissionState(), order(A.PAUSE), 1.0)
     assert ms.obey(over, order(A.PAUSE), 2.0) == (over, refused)
 

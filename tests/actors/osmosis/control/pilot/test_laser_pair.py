@@ -95,6 +95,13 @@ def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
     assert not len(bench.view.points)
 
 
+def test_the_nearer_echo_of_each_ray_counts_whichever_of_them_has_it():
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, (8, 2.5, 4, 8, 8)), 0.0)
+    bench.feed(LOWER, healthy(2, (8, 8, 3, 3.5, 8)), 0.0)
+    assert distances(bench.view) == [2.5, 3.0, 3.5]
+
+
 @pytest.mark.parametrize("other", [
     LaserScan(-0.3, 0.1, TOP_M, np.full(7, 4, "<f4").tobytes(), 0.1001),
     LaserScan(-0.2, 0.05, TOP_M, np.full(9, 4, "<f4").tobytes(), 0.1001),
