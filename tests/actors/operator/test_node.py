@@ -64,6 +64,8 @@ async def test_what_fails_is_told_in_one_line_and_the_page_goes_on_or_is_closed_
     async with visited(world) as (hmi, page):
         assert "reset failed" in (await ask(page, type="reset", recovery="RM1"))["text"]
         await hear(page, "state")
+        later_s = hmi.clock.now() + 1.1
+        await eventually(lambda: hmi.clock.now() > later_s)  # a node reports once a second
         monkeypatch.setattr(hmi_feed.Feed, "push", fail)
         async with open_page(await served(hmi)) as other:
             await other.wait_closed()
