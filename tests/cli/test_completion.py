@@ -1,7 +1,5 @@
 """What the shell offers: verbs, and nodes, topics and faults of the system at hand."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a user meets on the first day: ports, names that are none, faults by name, exit codes."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """What happens while a run loads: ctrl-C, the garbage collector, imports."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

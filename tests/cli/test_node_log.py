@@ -1,7 +1,5 @@
 """`rampart node log`: the last lines of a log."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 from rampart.actors.foreign.program import LOGS

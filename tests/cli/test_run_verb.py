@@ -1,7 +1,5 @@
 """`rampart run` and `launch.py`: the same options, each under its own name and with its reports."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """docs/reference/api.md: what it lists is there."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import subprocess

@@ -4,8 +4,6 @@ The commands take minutes to hours, so only one is executed; tests of runs and c
 the others on less. `make campaign` is one of them.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 

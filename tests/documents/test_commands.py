@@ -1,7 +1,5 @@
 """docs/reference/commands.md is made from the parsers, which describe every option."""
 
-from __future__ import annotations
-
 import re
 
 from rampart.cli.commands_page import markdown

@@ -1,7 +1,5 @@
 """docs/how-to/mujoco-world.md: its world replaces that of a new robot, and does what it claims."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """`topics.md` says what the code says."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

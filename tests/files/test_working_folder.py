@@ -1,7 +1,5 @@
 """Modules are imported from the working folder only if no other user can write there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

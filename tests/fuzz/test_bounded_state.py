@@ -1,7 +1,5 @@
 """No flood of names makes an actor, or what shows a run, remember more than it has room for."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import types

@@ -1,7 +1,5 @@
 """Each decoder accepts an input or refuses it with its documented error, within the limits."""
 
-from __future__ import annotations
-
 import contextlib
 from functools import cache
 

@@ -1,7 +1,5 @@
 """No message that its type allows ends an actor, takes long, or makes it publish a bad one."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

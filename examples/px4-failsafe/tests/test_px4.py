@@ -1,7 +1,5 @@
 """The replay of PX4's failsafe tests: each decision, and what would be found if it were wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

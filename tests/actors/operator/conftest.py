@@ -1,7 +1,5 @@
 """An HMI in a small world, and a page on it."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart.actors.operator import stick_arbitration

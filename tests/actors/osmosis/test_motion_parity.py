@@ -1,7 +1,5 @@
 """Odometry, encoders and gyro of a robot that drives a circle; faults are seen by their readers."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

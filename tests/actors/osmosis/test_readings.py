@@ -1,7 +1,5 @@
 """An invalid reading counts as missing."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec

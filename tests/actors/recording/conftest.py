@@ -1,7 +1,5 @@
 """A small recording, and a port for a run."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart.testing import free_base_port

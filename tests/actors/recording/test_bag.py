@@ -1,7 +1,5 @@
 """Recordings as files: read back by the independent `mcap` library, torn, foreign and damaged."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

@@ -1,7 +1,5 @@
 """The black box: the time around a fault is kept, whatever dies, and the robot is undisturbed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

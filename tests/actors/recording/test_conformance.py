@@ -1,7 +1,5 @@
 """The reader of recordings, and `repair`, on files of other writers: of `mcap` and of rosbag2."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recordings with a damaged byte: what is outside its record is read, nothing is invented."""
 
-from __future__ import annotations
-
 import json
 import random
 

@@ -1,7 +1,5 @@
 """Recordings as tables, read back by other readers."""
 
-from __future__ import annotations
-
 import csv
 import json
 import sys

@@ -1,7 +1,5 @@
 """A recorded robot in MuJoCo: as a video, which another program reads, and in the viewer."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

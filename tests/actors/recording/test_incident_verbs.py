@@ -1,7 +1,5 @@
 """`rampart incident`: what a user sees of incidents, also after everything was killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

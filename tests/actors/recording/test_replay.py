@@ -1,7 +1,5 @@
 """What is played back is what was recorded, readers take it, and no robot can hear it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -7,8 +7,6 @@ own machine alone, as nodes of `rmw_zenoh` do. It publishes /odom and writes eac
 With a mode, commands are sent for four seconds, and the number of odometries is written.
 """
 
-from __future__ import annotations
-
 import asyncio
 import sys
 import threading

@@ -11,8 +11,6 @@ line of JSON for each message, request and transition.
 word on standard input sets that: well, bad or quiet (no status); log (a line); succeed or abort.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -5,8 +5,6 @@
 One line of JSON a message: type, fields, and the bytes, hexadecimal.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

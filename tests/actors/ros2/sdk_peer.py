@@ -6,8 +6,6 @@ It says its odometry 20 times a second, offers /base/shut, and writes a line of 
 command that it hears.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

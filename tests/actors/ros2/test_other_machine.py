@@ -1,7 +1,5 @@
 """A gateway on another machine than ROS 2, in a network namespace each."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

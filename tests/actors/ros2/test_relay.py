@@ -1,7 +1,5 @@
 """The gateway beside nodes in rclpy, over DDS."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

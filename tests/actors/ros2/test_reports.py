@@ -1,7 +1,5 @@
 """Detections of errors that nodes of ROS 2 report: timelines, and from their wire on."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 

@@ -1,7 +1,5 @@
 """A gateway at a router of ROS 2 with TLS and access rules, that ends and starts again."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 

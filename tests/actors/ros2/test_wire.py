@@ -1,7 +1,5 @@
 """The wire format beside captures of a live rmw_zenoh_cpp (Humble, 0.1.8), and what is none."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 

@@ -1,7 +1,5 @@
 """`rampart doctor`, and the help of `rampart`."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 

@@ -1,7 +1,5 @@
 """Driving by keys: what a terminal sends, and the dead man that lives on its repetition."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

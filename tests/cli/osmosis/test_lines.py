@@ -1,7 +1,5 @@
 """What `rampart status` says of Osmosis."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart.actors.osmosis import messages as m

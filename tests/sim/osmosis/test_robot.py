@@ -1,7 +1,5 @@
 """The drive's electronics, and how the Summit XL moves in MuJoCo, as bounds with a meaning."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The simulator actor: topics, rates, stamps, and what it does with its inputs."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import partial
 

@@ -1,7 +1,5 @@
 """A world that blows up, or dies, ends its run, which no judge has watched to its end."""
 
-from __future__ import annotations
-
 import pytest
 
 from rampart.sim.osmosis.world import World

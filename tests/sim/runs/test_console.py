@@ -1,7 +1,5 @@
 """Terminal output of a run."""
 
-from __future__ import annotations
-
 from io import StringIO
 
 import msgspec

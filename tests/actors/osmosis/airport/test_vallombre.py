@@ -1,7 +1,5 @@
 """The shipped airport as the rest of the system relies on it, and the photometry of its lights."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """A lane along x, 5 m wide, for modules that guard its edge."""
 
-from __future__ import annotations
-
 from shapely.geometry import box
 
 from rampart.actors.osmosis.airport.model import Airport, StartPose

@@ -1,7 +1,5 @@
 """RM6: another plan is asked of the Mission Manager."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

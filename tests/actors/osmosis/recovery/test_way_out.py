@@ -1,7 +1,5 @@
 """A robot that stands in a prohibited area is driven out by its operator, and no other way."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from contextlib import asynccontextmanager

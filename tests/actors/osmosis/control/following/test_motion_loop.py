@@ -1,7 +1,5 @@
 """The yaw loop against a dragging wheel, at the robot and at its standby."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

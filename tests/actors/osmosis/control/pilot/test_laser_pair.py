@@ -1,7 +1,5 @@
 """Two lasers: whatever happens to one of them, the other's view stays, and nothing is unseen."""
 
-from __future__ import annotations
-
 import math
 import random
 

@@ -1,7 +1,5 @@
 """Which routes may be driven: the planner's own may, and what a fault makes of them may not."""
 
-from __future__ import annotations
-
 import math
 from random import Random
 

@@ -1,7 +1,5 @@
 """A stick that is held while the robot is stopped does nothing when the stop ends."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

@@ -1,7 +1,5 @@
 """Teleoperation: one joystick drives, and its release or silence is one stop."""
 
-from __future__ import annotations
-
 import asyncio
 
 from rampart.actors.bus import topics as bus_topics
