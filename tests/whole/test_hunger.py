@@ -139,8 +139,8 @@ def grown(run: RealRun, before: dict[str, float]) -> dict[str, float]:
 
 
 def pids(run: RealRun) -> dict[str, int]:
-    """Return the processes by name; spares come and go."""
-    return {name: p.pid for name, p in processes(run).items() if "spare" not in name}
+    """Return the processes by name; those of the pool come and go."""
+    return {name: p.pid for name, p in processes(run).items() if name != "pool"}
 
 
 @pytest.fixture
