@@ -1,5 +1,6 @@
-"""What verification finds about the shipped system, and that it finds what is broken on purpose."""
+"""What verification finds about the shipped system and broken ones; the table of all pairs."""
 
+import asyncio
 import gc
 import json
 import math
@@ -14,6 +15,7 @@ from rampart.cli.analyse import decide_verbs
 from rampart.cli.main import main
 from rampart.manager.analysis import active_sets
 from rampart.manager.analysis.active_sets import ActiveSets, order_agrees_with_tree
+from rampart.manager.analysis.pairs import Pair, causes_of, pairs
 from rampart.manager.analysis.transitions import Transitions, explore
 from rampart.manager.analysis.verification import MEANING, Report, verify
 from rampart.manager.model.mechanisms import RecoveryPhase
@@ -21,7 +23,9 @@ from rampart.manager.model.order import PartialOrder
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.guarded_repair import GuardedRepair
 from rampart.manager.strategies.safety_first import SafetyFirst
-from tests.manager.bench import edited, paper
+from rampart.testing import run
+from tests import ROOT
+from tests.manager.bench import Managed, edited, full_system, paper
 
 SPEC = paper()
 ARRANGEMENT = Arrangement(SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order())
@@ -304,3 +308,68 @@ def test_the_command_prints_a_table_and_the_traces_of_the_system_s_strategy(
     told = capsys.readouterr().out
     assert "fails under mission-first" in told
     assert "--strategy NAME" not in told
+
+
+# -- the table of all ordered pairs is what the running manager does
+
+
+SOON_S = 0.05
+
+
+async def become(system: Managed, *mechanisms: str) -> tuple[str, ...]:
+    """Make exactly these mechanisms active; return the recoveries that are in force then."""
+    spec = system.run.system
+    system.detect(*(cause for name in mechanisms for cause in causes_of(spec, name)))
+    await asyncio.sleep(SOON_S)
+    return tuple(r.name for r in spec.recoveries if system.actors[r.name].activated)
+
+
+async def played(system: Managed, first: str, second: str) -> Pair:
+    found = []
+    for remaining in (second, first):
+        await become(system, first)
+        both = await become(system, first, second)
+        found += [await become(system, remaining), await become(system)]
+        for latched in system.status.latched:
+            await system.reset(latched)
+        assert await become(system) == ()
+    return Pair(first, second, both, found[0], found[2], found[1])
+
+
+@pytest.mark.parametrize("system", [full_system, paper])
+def test_the_running_manager_does_what_the_table_lists_for_each_ordered_pair(system):
+    spec = system()
+    timing = msgspec.structs.replace(spec.timing, release_hold_s=0.0, release_hold_max_s=0.0)
+    spec = msgspec.structs.replace(spec, timing=timing)
+    table = pairs(spec)
+    count = len(spec.mechanisms)
+    assert len(table) == count * (count - 1)
+
+    async def scenario() -> None:
+        async with Managed(spec) as managed:
+            for pair in table:
+                assert await played(managed, pair.first, pair.second) == pair
+
+    run(scenario)
+
+
+def test_the_page_has_what_the_command_prints(capsys):
+    assert main(["explain", "--pairs"]) == 0
+    page = (ROOT / "docs/case-study/pairs.md").read_text(encoding="utf-8")
+    assert f"```\n{capsys.readouterr().out}```\n" in page, (
+        "make it anew: `rampart explain --pairs`")
+
+
+def test_the_rows_as_json(capsys):
+    assert main(["explain", "paper", "--pairs", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 42
+    assert {"first": "FTM4", "second": "FTM6", "both": ["RM5"], "first_clears": ["RM5"],
+            "second_clears": ["RM3"], "both_clear": []} in rows
+
+
+def test_a_mechanism_with_a_gate_is_made_active_by_the_fewest_modules():
+    spec = msgspec.structs.replace(paper(), mechanisms=tuple(
+        msgspec.structs.replace(each, detect="(DM1 and DM3) or (DM2 and DM3 and DM6)")
+        if each.name == "FTM1" else each for each in paper().mechanisms))
+    assert causes_of(spec, "FTM1") == ("DM1", "DM3")

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from rampart.manager.analysis.barriers import guard
 from rampart.manager.model.fault_tree import Event, FaultTree, FaultTreeError
 from rampart.manager.model.gates import (
     MAX_NAMES,
@@ -119,6 +120,30 @@ def test_a_placement_that_makes_no_tree_is_refused(placement, subject, message):
 def test_what_is_no_fault_tree_is_refused(events, message):
     with pytest.raises(FaultTreeError, match=message):
         FaultTree(events)
+
+
+# -- which mechanisms stand between causes and the top event
+
+
+def test_on_the_paper_s_tree_each_cause_has_the_barriers_above_it():
+    found = {g.events: g.barriers for g in guard(paper(), [
+        ("control_node_crash",), ("localization_node_crash",), ("command_calculation_error",),
+        ("actuator_failure",), ("control_node_crash", "command_calculation_error")])}
+    assert found == {
+        ("control_node_crash",): ("FTM1", "FTM2", "FTM4"),
+        ("localization_node_crash",): ("FTM1", "FTM6", "FTM7"),
+        ("command_calculation_error",): ("FTM1", "FTM3"),
+        ("actuator_failure",): ("FTM1",),
+        # by two ways, each with a barrier of its own
+        ("control_node_crash", "command_calculation_error"): ("FTM1",)}
+
+
+def test_an_event_that_is_kept_from_occurring_does_not_spread():
+    events = tree(top=(2, "a g"), g=(2, "b c d"))
+    assert "top" in events.occurring(["a", "b", "c"])
+    assert "top" not in events.occurring(["a", "b", "c"], "g")
+    assert "top" not in events.occurring(["a", "b", "c"], "b")
+    assert "top" in events.occurring(["a", "b", "c", "d"], "b")
 
 
 # -- gates: truth tables, precedence, negation, silence, and every refusal word for word
