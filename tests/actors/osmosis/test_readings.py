@@ -23,7 +23,7 @@ from rampart.actors.osmosis.readings import (
 )
 from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
-from tests.actors.osmosis.control.laser_sweeps import RAYS, full_sweep
+from tests.actors.osmosis.control.world import RAYS, full_sweep
 from tests.osmosis_system import shipped_system
 from tests.whole.missions import write_mission
 

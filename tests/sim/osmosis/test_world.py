@@ -1,4 +1,4 @@
-"""The world: time, obstacles, dead man, collisions, prohibited area, determinism."""
+"""The world: time, obstacles, collisions, the prohibited area; and one that blows up or dies."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import msgspec
 import pytest
 import shapely
 
-from rampart.actors.osmosis.airport.model import (
-    Airport,
-    ObstaclePreset,
-    StartPose,
-    rectangle,
-)
+from rampart.actors.osmosis.airport.model import Airport, ObstaclePreset, StartPose, rectangle
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.sim.osmosis.scene import SPARE_OBSTACLES, WorldError
 from rampart.sim.osmosis.world import WORLD_STATE, Clearance, World
+from rampart.testing import virtual_run
 from tests.sim.osmosis import bench
 
 # A road 40 m long and 4 m wide, eastward; the robot starts in its west.
@@ -185,3 +181,42 @@ def test_what_makes_no_sense_is_refused():
         WORLD_STATE.decode(1, WORLD_STATE.encode(kept))
     with pytest.raises(WorldError, match="time must be finite"):
         world().step_to(math.nan)
+
+
+# ---- a world that blows up, or dies: no judge has watched it to its end --------------------------
+
+BLOWS_UP_S = 3.0
+
+
+@pytest.fixture
+def blowing_up(monkeypatch):
+    tick = World._tick
+
+    def blow_up(self):
+        if self.time_s >= BLOWS_UP_S and not self.data.warning.number.any():
+            self.data.qvel[0] = 1e12
+        tick(self)
+
+    monkeypatch.setattr(World, "_tick", blow_up)
+
+
+@pytest.mark.usefixtures("blowing_up")
+def test_a_run_whose_world_blows_up_ends_at_once_and_is_neither_safe_nor_a_success():
+    done = virtual_run("paper", options={"mission": "A"})
+    assert (done.record.mission, done.record.safety) == ("fail", "not known")
+    assert (done.judgement.success, done.judgement.safe) == (False, None)
+    assert done.record.duration_s < BLOWS_UP_S + 0.5
+    assert done.record.reasons[0].startswith("physics unstable")
+
+
+def test_a_run_whose_world_dies_is_neither_safe_nor_a_success(monkeypatch):
+    tick = World._tick
+
+    def die(self):
+        if self.time_s >= BLOWS_UP_S:
+            raise RuntimeError("died")
+        tick(self)
+
+    monkeypatch.setattr(World, "_tick", die)
+    done = virtual_run("paper", options={"mission": "A"})
+    assert (done.record.mission, done.record.safety) == ("fail", "not known")

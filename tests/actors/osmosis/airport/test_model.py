@@ -1,16 +1,17 @@
-"""Airport geometry and the checks that an airport must pass to be loaded."""
+"""Airport geometry, the checks of an airport, and the shipped one as the rest relies on it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.airport.formats import mission_problems, problems
+from rampart.actors.osmosis.airport.formats import load_airport, mission_problems, problems
 from rampart.actors.osmosis.airport.model import (
     Airport,
     Light,
@@ -20,6 +21,8 @@ from rampart.actors.osmosis.airport.model import (
     StartPose,
     rectangle,
 )
+from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, illuminance_per_candela
+from rampart.actors.osmosis.control.planning.route_search import plan_route
 
 # A square ring of pavement: outer 20 m, with a prohibited island of 8 m in the middle.
 RING = shapely.box(0, 0, 20, 20).difference(shapely.box(6, 6, 14, 14))
@@ -87,3 +90,31 @@ def test_each_fault_of_a_mission_is_found_and_named(goals, edges, expected):
     mission = Mission("M", tuple(MissionGoal(x_m, y_m, "taxi") for x_m, y_m in goals))
     found = [f"{p.field}: {p.remedy}" for p in mission_problems(mission, airport(edges=edges))]
     assert any(line.startswith(expected) for line in found)
+
+
+# ---- the shipped airport, and the photometry of its lights ---------------------------------------
+
+AIRPORT = load_airport("vallombre")
+
+
+def test_light_verification_legs_pass_over_every_light():
+    legs = [shapely.LineString([(a.x_m, a.y_m), (b.x_m, b.y_m)])
+            for a, b in pairwise(AIRPORT.missions["AB"].goals) if b.mode == "light verification"]
+    assert len(AIRPORT.lights) >= 20
+    for light in AIRPORT.lights:
+        assert min(leg.distance(shapely.Point(light.x_m, light.y_m)) for leg in legs) < 0.05
+
+
+def test_there_is_another_way_whichever_edge_is_closed():
+    for edge in AIRPORT.edges:
+        left = [other for other in AIRPORT.edges if other != edge]
+        a, b = (AIRPORT.nodes[name] for name in edge)
+        assert plan_route(AIRPORT.nodes, left, a, b).waypoints, edge
+
+
+def test_photometry_follows_the_inverse_square_and_the_cosine_law():
+    assert illuminance_per_candela(0.0) == pytest.approx(1 / SENSOR_HEIGHT_M**2)
+    # As far sideways as high: twice the square of the distance, cosine 1 / sqrt 2.
+    expected = 1 / (2 * SENSOR_HEIGHT_M**2) / math.sqrt(2)
+    assert illuminance_per_candela(SENSOR_HEIGHT_M) == pytest.approx(expected)
+    assert illuminance_per_candela(4.0) < 0.001 * illuminance_per_candela(0.0)

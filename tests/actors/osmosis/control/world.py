@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull, Polyline
+from rampart.actors.osmosis.messages import LaserScan
 
 HULL = Hull()
 DT_S = 0.05
@@ -99,3 +100,15 @@ def drive(world: World, follower, seconds: float, gate: Gate | None = None):
             linear, angular = gate(linear, angular, points)
         world.move(linear, angular)
     return motion
+
+
+RAYS = 181
+TOP_M = 8.0
+STEP_RAD = math.radians(270) / (RAYS - 1)
+
+
+def full_sweep(range_m: float = TOP_M, number: int = 0) -> LaserScan:
+    """Return a sweep with one range in all directions; `number` distinguishes sweeps."""
+    return LaserScan(
+        -math.radians(135), STEP_RAD, TOP_M, np.full(RAYS, range_m, "<f4").tobytes(),
+        0.1 + 0.001 * math.sin(number + 1))

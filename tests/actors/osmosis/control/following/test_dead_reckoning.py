@@ -14,8 +14,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
-from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.actors.osmosis.control.world import World
+from tests.actors.osmosis.control.world import World, full_sweep
 from tests.osmosis_system import in_system, shipped_system
 
 PERIOD_S = 0.02

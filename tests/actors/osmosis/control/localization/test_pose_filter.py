@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
@@ -9,9 +10,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
+from rampart.actors.osmosis.control.localization.localization import Localization
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.pose_filter import FilterLimits, PoseFilter
+from rampart.actors.osmosis.motion_check import TURNING_TRACK_M, WHEEL_RADIUS_M, MotionParity
+from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
     SOURCES,
@@ -23,11 +31,13 @@ from tests.actors.osmosis.control.localization_drive import (
     Voted,
     disturbed,
     fault,
+    field_airport,
     mis_stamped,
     sensor_faults,
     watch,
     with_absurd,
 )
+from tests.osmosis_system import in_system, shipped_system
 
 FROM_S, FOR_EVER = 4.0, math.inf
 
@@ -257,3 +267,112 @@ def test_the_filter_is_the_textbook_one(moves):
         assert math.remainder(ekf.yaw_rad - state[2], math.tau) == pytest.approx(0.0, abs=1e-9)
         assert ekf.position_sd_m**2 == pytest.approx(np.linalg.eigvalsh(p[:2, :2])[1], abs=1e-9)
         assert ekf.heading_sd_rad**2 == pytest.approx(p[2, 2], abs=1e-9)
+
+
+# ---- the nodes, on the bus with the simulated robot ----------------------------------------------
+
+FIELD = {"system": shipped_system(), "airport": field_airport()}
+
+
+@in_system(**FIELD)
+async def test_it_publishes_the_pose_20_times_a_second_and_says_which_source_is_excluded(system):
+    truth, poses = system.hear(topics.TRUTH), system.hear(topics.POSE)
+    told = system.hear(topics.LOCALIZATION_STATUS)
+    system.start("simulator", Simulator, seed=3)
+    system.start("localization", FusedLocalization, bridge_m=2.0)
+
+    async def drive(seconds: float) -> m.LocalizationStatus:
+        """Drive in a circle."""
+        for _ in range(round(seconds / 0.05)):
+            system.say(topics.BASE_COMMAND, m.BaseCommand(0.8, 0.2))
+            await asyncio.sleep(0.05)
+        return told[-1].message
+
+    def fail(name: str) -> None:
+        for order in OsmosisFaults().find(name, 0, topics.ALL).orders(name, math.inf):
+            system.say(bus_topics.INJECT, order)
+
+    def error_m() -> float:
+        """Worst distance of a pose to the truth nearest in time, less the way in between."""
+        worst_m = 0.0
+        for _, _, header, pose in poses:
+            true = min(truth, key=lambda t: abs(t.header.stamp - header.stamp))
+            place = true.message.pose
+            off_m = math.dist((pose.x_m, pose.y_m), (place.x_m, place.y_m))
+            worst_m = max(worst_m, off_m - 0.8 * abs(true.header.stamp - header.stamp))
+        return worst_m
+
+    status = await drive(5.0)
+    stamps = [pose.header.stamp for pose in poses]
+    assert 95 <= len(stamps) <= 101
+    assert max(pose.time_s - pose.header.stamp for pose in poses) < 0.05
+    assert stamps == sorted(set(stamps))
+    assert error_m() < 0.03
+    assert sorted(status.in_use) == ["GPS", "IMU", "absolute pose", "odometry"]
+    assert (status.excluded, status.bridged_m) == ((), 0.0)
+    assert 0 < status.position_sd_m < 0.03
+    assert 0 < status.heading_sd_rad < 0.02
+    fail("gps-bias")
+    status = await drive(3.0)
+    assert status.excluded == (("GPS", "moves differently from the others, 0.6 m"),)
+    assert error_m() < 0.05
+    fail("absolute-pose-dropout")
+    await drive(5.0)  # 4 m: twice as far as it bridges
+    assert truth[-1].header.stamp - poses[-1].header.stamp > 1.0
+
+
+@in_system(**FIELD)
+async def test_the_papers_localization_passes_on_what_is_newer_and_can_be(system):
+    poses = system.hear(topics.POSE)
+    system.start("localization", Localization)
+    await system.settle()
+    bad = {2: math.inf, 3: 1e9, 4: math.nan, 5: 0.05}
+    for i in range(10):
+        system.say(topics.ABSOLUTE_POSE, m.Pose(math.nan if i == 6 else float(i), 0.0, 0.0),
+                   stamp_s=bad.get(i))
+        await asyncio.sleep(0.05)
+    assert [pose.message.x_m for pose in poses] == [0.0, 1.0, 7.0, 8.0, 9.0]
+
+
+# ---- parity of odometry, encoders and gyro -------------------------------------------------------
+
+STEP_S = 0.02
+
+
+def drive(parity, seconds, *, start_s=0.0, without=(), ahead_s=0.0):
+    """Drive a circle at 1 m/s and 0.2 rad/s; return the time at its end."""
+    now_s, aside = start_s, 0.2 * TURNING_TRACK_M / 2
+    wheels = tuple(mps / WHEEL_RADIUS_M for mps in (1.0 - aside, 1.0 + aside) * 2)
+    for _ in range(round(seconds / STEP_S)):
+        now_s += STEP_S
+        stamp_s = now_s + ahead_s
+        yaw = math.remainder(0.2 * now_s, math.tau)
+        if "imu" not in without:
+            parity.imu(m.Imu(yaw, 0.2, 0.0, 0.2), stamp_s, now_s)
+        if "odometry" not in without:
+            at = m.Pose(5 * math.sin(yaw), 5 * (1 - math.cos(yaw)), yaw)
+            parity.odometry(m.Odometry(at, m.Twist(1.0, 0.2)), stamp_s, now_s)
+        if "encoders" not in without:
+            parity.encoders(m.BaseStatus(False, False, 0.0, wheels), stamp_s, now_s)
+    return now_s
+
+
+@pytest.mark.parametrize("lost", [
+    (), ("encoders",), ("odometry",), ("imu",), ("odometry", "imu", "encoders")])
+def test_what_is_silent_confirms_nothing_and_a_turn_missed_in_part_is_held_against_nobody(lost):
+    """The event loop of a module was late, or messages were lost."""
+    parity = MotionParity()
+    end_s = drive(parity, 1.0, start_s=drive(parity, 5.0), without=lost)
+    assert parity.confirmed(end_s) == ("encoders" not in lost and "odometry" not in lost)
+    assert parity.sure(end_s)
+    drive(parity, 1.0, start_s=end_s)
+    assert parity.gyro_agrees
+
+
+def test_stamps_from_the_future_shut_out_none():
+    parity = MotionParity()
+    end_s = drive(parity, 1.0)
+    drive(parity, STEP_S, start_s=end_s, ahead_s=1e9)
+    end_s = drive(parity, 5.0, start_s=end_s)
+    assert parity.confirmed(end_s)
+    assert parity.gyro_agrees

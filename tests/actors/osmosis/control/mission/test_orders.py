@@ -16,7 +16,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode
-from tests.actors.osmosis.control.laser_sweeps import full_sweep
+from tests.actors.osmosis.control.world import full_sweep
 from tests.actors.osmosis.driven_robot import Driven, driven
 from tests.osmosis_system import in_system, shipped_system
 from tests.virtual_time import within

@@ -1,12 +1,16 @@
-"""Teleoperation: one joystick drives, and its release or silence is one stop."""
+"""One joystick drives; its release, its silence and an emergency stop are one stop each."""
 
 import asyncio
+
+import pytest
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from tests.actors.osmosis.driven_robot import driven
 from tests.osmosis_system import in_system, shipped_system
+from tests.virtual_time import within
 
 STOP, LEFT = (0.0, 0.0), (1.0, 2.0)
 
@@ -43,3 +47,31 @@ async def test_the_first_who_holds_drives_until_it_lets_go_or_falls_silent(syste
     await asyncio.sleep(1.0)
     assert driven() == [*[LEFT] * 20, STOP]
     assert "silent for 0.3 s" in told[-1].message.reason
+
+
+STANDING_MPS = 0.02
+
+
+@pytest.mark.parametrize("restarted", [
+    "", "safety_pilot", "teleoperation", "teleoperation, back after the stop"])
+@within(driven)
+async def test_a_stick_held_all_through_an_emergency_stop_drives_only_after_it_was_let_go(
+        robot, restarted):
+    robot.hold(0.75)
+    await robot.until(lambda: robot.speed_mps > 0.7)
+    robot.system.inject(topics.GPS, "drop", 2.0)
+    await robot.until(lambda: "RM1" in robot.manager.latched)
+    late = "back" in restarted
+    if late:
+        await robot.system.kill("teleoperation")
+    await robot.until(lambda: robot.speed_mps < STANDING_MPS)
+    if restarted and not late:
+        await robot.restart(restarted)
+    await robot.reset()
+    if late:
+        robot.system.start_node("teleoperation")
+    assert await robot.fastest(1.5) < STANDING_MPS
+    robot.let_go()
+    await asyncio.sleep(0.1)
+    robot.hold(0.75)
+    assert await robot.fastest(1.0) > 0.7
