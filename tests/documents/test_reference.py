@@ -1,15 +1,22 @@
-"""docs/reference/specification.md: every field is in it, and its worked example works."""
+"""Pages of docs/reference: what they list is there, and what is there is listed."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import re
+import subprocess
+import sys
 
 import msgspec
 import pytest
 
+import rampart
+import rampart.testing
+from rampart.actors.ros2.stand_in import StandIn
 from rampart.actors.ros2.translation.tables import Ros2Link
+from rampart.actors.system.members import load_class
 from rampart.cli.main import main
 from rampart.manager.model.gates import detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
@@ -30,7 +37,7 @@ from rampart.manager.spec.schema import (
 from rampart.manager.spec.specification import SpecificationError, parse_specification
 from rampart.manager.spec.tables import End
 from rampart.testing import virtual_run
-from tests import TANK
+from tests import ROOT, TANK
 from tests.documents.page import Page
 
 PAGE = Page("reference/specification")
@@ -129,3 +136,66 @@ def test_the_judge_that_it_shows_judges(tmp_path, brim_m, safe, margin_m, why):
 def test_the_gates_it_shows_are_gates(text):
     assert f"`{text}`" in PAGE.text
     assert str(detection_gate(text)) == text
+
+
+ROS2 = Page("reference/ros2")
+FILLED_IN = {"ros2"}  # by the gateway itself
+
+
+def listed_in(text: str, header: str) -> set[str]:
+    """Return the names in the first column of the table with a header."""
+    table = text.partition(header)[2].partition("\n\n")[0]
+    return {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+            for name in re.findall(r"`(\w+)", row)}
+
+
+@pytest.mark.parametrize(("heading", "path"), [
+    ("The gateway's parameters", "rampart.actors.ros2.gateway:Gateway"),
+    ("The router", "rampart.actors.ros2.router:RosRouter"),
+    ("Stand-ins", "rampart.actors.ros2.stand_in:StandIn"),
+    ("Missing nodes", "rampart.actors.ros2.ros_nodes:RosNodes")])
+def test_the_table_has_each_parameter(heading, path):
+    listed = listed_in(ROS2.section(f"## {heading}"), "| parameter |")
+    known = {field.name for field in msgspec.structs.fields(load_class(path).Parameters)}
+    assert listed == known - FILLED_IN
+
+
+def test_a_stand_in_has_the_members_that_the_page_lists():
+    names = listed_in(ROS2.text, "| member |")
+    assert len(names) >= 6
+    for name in names - {"types"}:  # of each object
+        assert hasattr(StandIn, name), name
+
+
+API = Page("reference/api")
+NAMES = re.findall(r"^\| `(\w+)` \| `(rampart\.[\w.]+)` \|", API.text, re.MULTILINE)
+CLASSES = re.findall(r"^\| `(rampart\.[\w.]+:\w+)` \|", API.text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("name", "module"), NAMES)
+def test_a_name_is_imported_from_rampart_itself(name, module):
+    assert getattr(rampart, name) is getattr(importlib.import_module(module), name)
+
+
+def test_the_page_lists_what_rampart_exports():
+    assert sorted(name for name, _ in NAMES) == sorted(rampart.__all__) == dir(rampart)
+    with pytest.raises(AttributeError, match="module 'rampart' has no attribute 'nonsense'"):
+        _ = rampart.nonsense
+
+
+def test_to_import_rampart_costs_nothing():
+    done = subprocess.run(
+        [sys.executable, "-c", "import rampart, sys; print(*sys.modules)"], cwd=ROOT, check=True,
+        capture_output=True, text=True)
+    assert not {"numpy", "zenoh", "msgspec", "asyncio"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("path", CLASSES)
+def test_a_class_for_specifications_can_be_loaded(path):
+    assert load_class(path).__name__ == path.partition(":")[2]
+
+
+def test_every_name_for_tests_is_listed():
+    rows = re.findall(r"^\| (`.*?) \|", API.section("## Tests"), re.MULTILINE)
+    listed = re.findall(r"`(\w+)`", "".join(rows))
+    assert set(listed) == set(rampart.testing.__all__)
