@@ -32,8 +32,8 @@ from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock
 from rampart.testing import VirtualSystem, run
-from tests.fuzz.handler_fuzz import Machine, cases, system
 from tests.fuzz.message_extremes import all_topics, filled
+from tests.fuzz.test_handler_fuzz import Machine, cases, system
 
 FLOOD = 700
 """Messages of each topic, each about other names and half of them from another source."""

@@ -14,7 +14,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.testing import VirtualSystem
-from tests.fuzz.handler_fuzz import system
+from tests.fuzz.test_handler_fuzz import system
 from tests.virtual_time import within
 
 FORGED = 999_999
