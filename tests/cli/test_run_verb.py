@@ -1,5 +1,7 @@
 """`rampart run` and `launch.py`: the same options, each under its own name and with its reports."""
 
+import json
+import os
 import shutil
 import socket
 import subprocess
@@ -9,9 +11,11 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
+from rampart.cli.operate import kill_node
 from rampart.cli.run_options import parse, plan_of
-from rampart.testing.ports import free_base_port
+from rampart.testing import RealRun, free_base_port
 from tests import CELL, ROOT, TANK
+from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.web.pems import pair
 from tests.two_hosts import two_hosts
 
@@ -182,3 +186,77 @@ def test_a_bad_token_of_the_environment_is_refused_and_not_repeated(tmp_path, mo
     told = capsys.readouterr().err
     assert told.startswith("launch.py: RAMPART_HMI_TOKEN: token of 9 characters: ")
     assert "short-one" not in told
+
+
+SWALLOWING = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    sum(range(1000))
+except BaseException:
+    pass
+from tests.actors.ros2.robot import Base
+"""
+
+
+@pytest.mark.processes
+def test_a_module_that_swallows_an_interrupt_does_not_keep_the_run_from_ending(
+        tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    (tmp_path / "own_base.py").write_text(SWALLOWING)
+    (tmp_path / "own.toml").write_text(SYSTEM.replace("tests.actors.ros2.robot:Base",
+                                                      "own_base:Base"))
+    done = subprocess.run([sys.executable, "-m", "rampart.cli.main", "run", "--system", "own.toml",
+                           "--virtual", "--duration", "1"], cwd=tmp_path, capture_output=True,
+                          text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
+
+
+@pytest.mark.processes
+def test_a_world_is_loaded_without_glfw_which_would_start_a_process_in_the_middle_of_the_start():
+    code = ("import os, sys, rampart.sim.osmosis.world; "
+            "print('glfw' in sys.modules, 'MUJOCO_GL' in os.environ)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
+                          env={k: v for k, v in os.environ.items() if k != "MUJOCO_GL"})
+    assert done.stdout == "False False\n"
+
+
+@pytest.mark.processes
+def test_the_web_server_is_loaded_before_the_fork_and_only_for_a_page():
+    code = ("import sys; from rampart.cli.run_options import parse, plan_of\n"
+            f"for more in (['--no-hmi'], ['--hmi-port', '{free_base_port()}']):\n"
+            "    plan_of(*parse(more, 'run')); print('uvicorn' in sys.modules)")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True,
+                          check=True)
+    assert done.stdout == "False\nTrue\n"
+
+
+SICK = """
+from rampart import Actor
+
+class Sick(Actor):
+    def on_start(self) -> None:
+        raise RuntimeError("no sensor")
+"""
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+def test_a_real_run_with_a_node_that_never_comes_up_ends_with_1_and_names_it(
+        tmp_path, capsys):
+    (tmp_path / "first_day_parts.py").write_text(SICK)
+    nodes = "".join(f'[[node]]\nname = "{name}"\nactor = "{actor}"\nkind = "control"\n'
+                    for name, actor in (("gauge", "rampart.actors.runtime.stub_node:StubNode"),
+                                        ("sick", "first_day_parts:Sick")))
+    (tmp_path / "day.toml").write_text(
+        TANK.split("[[node]]")[0] + '[layers]\nftm = false\n[orders.safer]\n[[event]]\n'
+        'name = "e"\n' + nodes)
+    with RealRun(tmp_path, "day.toml", "--duration", "6") as day:
+        day.sleep_until(1)
+        assert kill_node.main(["gauge", "--json", "--port", str(day.port)]) == 0
+        code, result = day.result()
+    killed = json.loads(capsys.readouterr().out)
+    assert (killed["node"], killed["signal"], killed["incarnation"]) == ("gauge", "KILL", 1)
+    assert result["restarts"]["gauge"] == 1
+    assert (code, result["format"], result["failing"]) == (1, 1, ["sick"])
+    assert "sick fails again and again; it was restarted " in day.story

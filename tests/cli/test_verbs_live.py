@@ -21,9 +21,14 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
+from rampart.actors.osmosis.messages import MissionPhase
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.fault_watch import Order
+from rampart.actors.runtime.run_context import RunContext
 from rampart.cli import systems
 from rampart.cli.main import main
 from rampart.cli.run_picture import RunPicture, draw
@@ -392,3 +397,59 @@ async def test_obstacles_come_move_and_go(run):
     assert run.node.obstacles == {}
     err = await run.err(1, "obstacle", "add", "moon", "1", "2", "--radius", "9")
     assert err == "rampart: no effect: too big\n"
+
+
+GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
+REQUEST = m.MissionRequest("r1/first", "AB", GOALS)
+
+
+class Planner(Actor):
+    """Stands for the rest: it tells the first route, so that home is known."""
+
+    outputs = (topics.MISSION_REQUEST, topics.ROUTE, ftm_topics.MANAGER_STATUS)
+
+
+@pytest.fixture
+async def mission_run(monkeypatch, capsys, bus_folder):
+    on_map = RunContext(application=Osmosis.on_map(load_airport("vallombre")))
+    async with running(monkeypatch, capsys, bus_folder,
+                       ("mission_manager", MissionManager,
+                        {"parameters": {"held_by": ["RM2"]}, "run": on_map}),
+                       ("planner", Planner, {"run": on_map})) as made:
+        yield made
+
+
+def begin(run: Run) -> None:
+    """Have the Mission Manager under way, with a home to return to."""
+    run.node.request(REQUEST, None)
+    run.node.route(m.Route("r1/first", 0, m.Mode.TAXI, True, ((0.0, 0.0), (1.0, 2.0)), ""), None)
+
+
+async def test_an_order_reaches_the_mission_once_with_its_reason(mission_run):
+    begin(mission_run)
+    told = json.loads(await mission_run.out("mission", "replan", "--json"))
+    assert (told["accepted"], told["plan"], mission_run.node.state.plan) == (True, 1, 1)
+    assert told["mission"].items() >= {"mission_id": "r1/first", "name": "AB", "phase": "running",
+                                       "goals": 2}.items()
+    out = await mission_run.out("mission", "pause", "--reason", "runway in use")
+    assert out == ("pause obeyed; mission AB paused, step 1 of 2, 0 lights measured: "
+                   "operator: runway in use\n")
+    assert mission_run.node.state.phase is MissionPhase.PAUSED
+
+
+async def test_an_order_that_makes_no_sense_is_refused_with_the_reason_and_exit_code_1(mission_run):
+    error = await mission_run.err(1, "mission", "pause")
+    assert error == "rampart: pause refused: no mission is under way\n"
+    begin(mission_run)
+    code, out, _ = await mission_run.call("mission", "resume", "--json")
+    told = json.loads(out)
+    assert (code, told["accepted"]) == (1, False)
+    assert told["reason"] == "the mission is not paused but running"
+
+
+async def test_without_an_answer_the_verb_says_so(mission_run, monkeypatch):
+    monkeypatch.setattr(MissionManager, "publish", lambda *_: None)
+    monkeypatch.setattr("rampart.cli.osmosis.mission_verb._ANSWER_S", 0.5)
+    code, out, err = await mission_run.call("mission", "pause")
+    assert (code, out) == (1, "")
+    assert err == "rampart: no effect: the Mission Manager did not answer within 0.5 s\n"

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,17 +14,22 @@ import pytest
 
 from rampart import systems as shipped
 from rampart.actors.bus.run_info import RunInfo
+from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.cli import systems
+from rampart.cli import completion, systems
+from rampart.cli.look import doctor_verb
+from rampart.cli.look.doctor_verb import Finding
 from rampart.cli.look.topic_verbs import in_line, resolve
 from rampart.cli.main import build_parser, main
+from rampart.cli.operate import node_verbs
 from rampart.cli.operate.inject_verb import choose
 from rampart.cli.output import UsageError
 from rampart.sim.campaign.job import read_document_of
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
-from tests import CELL
+from rampart.testing.ports import free_base_port
+from tests import CELL, ROOT
 from tests.porter_actors import write_porter_system
 
 
@@ -250,3 +259,99 @@ def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_pa
     read_document_of.cache_clear()  # what a campaign's job runs is what was checked
     assert read_document_of("paper")[1]["name"] == "osmosis"
     read_document_of.cache_clear()
+
+
+def test_this_machine_can_run_and_each_thing_that_is_missing_has_its_cost(capsys):
+    assert main(["doctor", "--json"]) == 0
+    found = [Finding(**one) for one in json.loads(capsys.readouterr().out)]
+    assert {"Python", "Linux", "memory", "open files", "Chromium", "ROS 2"} <= {
+        one.what for one in found}
+    assert all(bool(one.cost) == (one.state != "ok") for one in found)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert {f"extra {name}" for name in project["optional-dependencies"] if name != "dev"} <= {
+        one.what for one in found}
+    assert main(["doctor"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(found)
+
+
+@pytest.mark.parametrize(("load", "limit", "states"), [
+    (0.3, 4096, ["ok", "ok"]), (11.7, 50, ["without", "missing"])])
+def test_a_busy_machine_and_too_few_open_files_are_found_before_a_run(
+        capsys, monkeypatch, load, limit, states):
+    monkeypatch.setattr(doctor_verb.os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(doctor_verb.os, "getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr(doctor_verb.resource, "getrlimit", lambda _which: (limit, limit))
+    assert main(["doctor", "--json"]) == states.count("missing")
+    assert [one["state"] for one in json.loads(capsys.readouterr().out)
+            if one["what"] in {"processors", "open files"}] == states
+
+
+def test_the_help_lists_every_verb_but_old_names_on_one_screen(capsys):
+    assert main([]) == 0
+    told = capsys.readouterr().out
+    assert len(told.splitlines()) <= 40
+    assert max(map(len, told.splitlines())) < 90
+    verbs = build_parser().verbs
+    listed = [action.dest for action in verbs._choices_actions]
+    assert set(verbs.choices) - set(listed) == {"table", "trigger", "metrics", "incidents"}
+    for verb in listed:
+        assert f" {verb} " in told or f"{verb:<10}" in told
+
+
+def test_verbs_topics_and_faults_are_offered(tmp_path):
+    """As argcomplete's shell function asks for what may stand at the end of a line."""
+    for line, some in (("rampart topic echo localization/p", "localization/pose"),
+                       ("rampart inject gps-b", "gps-bias")):
+        subprocess.run([sys.executable, "-m", "rampart.cli.main"], check=True, timeout=30, env={
+            **os.environ, "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9",
+            "_ARGCOMPLETE": "1", "IFS": "\013",
+            "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "told"),
+            "RAMPART_PORT": str(free_base_port())})  # no run is there, whatever else runs
+        offered = (tmp_path / "told").read_text().split("\013")
+        assert some in {word.strip() for word in offered}
+
+
+def test_nodes_are_those_of_all_runs(monkeypatch):
+    monkeypatch.setattr(completion, "find_runs", lambda: [
+        SimpleNamespace(nodes=("pump", "valve")), SimpleNamespace(nodes=("pump",))])
+    assert completion.nodes() == ["pump", "valve"]
+
+
+def test_the_last_lines_are_of_both_files_and_harm_no_terminal(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(node_verbs, "find_run", lambda _port: SimpleNamespace(
+        folder=str(tmp_path), nodes=("wheels", "driver")))
+    (tmp_path / LOGS).mkdir()
+    file = tmp_path / LOGS / "wheels.log"
+    file.write_bytes(b"3\n\x1b[2J\tclear\xff\r\n")
+    (tmp_path / LOGS / "wheels.log.1").write_text("1\n2\n")
+    assert main(["node", "log", "wheels", "--lines", "3"]) == 0
+    assert capsys.readouterr().out == "2\n3\n\\u001b[2J\tclear\ufffd\n"
+    assert main(["node", "log", "driver"]) == 1
+    assert capsys.readouterr().err.endswith("nodes with output: wheels\n")
+    assert main(["node", "log", "wheel"]) == 2
+
+
+NO_RUN = "rampart: --port 31999: no run there; runs found: "
+
+
+@pytest.mark.parametrize("arguments", [
+    "adapt set strategy guarded-repair --port 31999", "node list --json --port 31999",
+    "topic echo no/such --port 31999", "inject drop:no/such --port 31999"])
+def test_that_there_is_no_run_is_said_before_anything_else(refused, arguments):
+    assert refused(*arguments.split()).startswith(NO_RUN)
+
+
+def test_the_environment_names_the_run(refused, monkeypatch):
+    monkeypatch.setenv("RAMPART_PORT", "31999")
+    assert refused("status").startswith(NO_RUN)
+    assert refused("status", "--port", "31998").startswith("rampart: --port 31998: ")
+    monkeypatch.setenv("RAMPART_PORT", "74x0")
+    assert "RAMPART_PORT=74x0: expected a whole number" in refused("status")
+
+
+def test_every_object_says_its_format(capsys):
+    for arguments in (("check", str(CELL)), ("explain", str(CELL)), (
+            "decide", "M_CURTAIN", "--system", str(CELL)), (
+            "topic", "info", "manager/status", "--system", str(CELL))):
+        assert main([*arguments, "--json"]) == 0
+        assert next(iter(json.loads(capsys.readouterr().out).items())) == ("format", 1)

@@ -1,4 +1,4 @@
-"""`rampart check` and `rampart explain`: what is known of a system before it runs."""
+"""`rampart check`, `explain` and `cut-sets`: what is known of a system before it runs."""
 
 from __future__ import annotations
 
@@ -97,3 +97,44 @@ def test_a_hang_of_a_command_is_detected_after_the_timeout_of_its_own_heartbeat(
     file.write_text(with_command("motion_planner", 1.0))
     _, err = said(capsys, "check", str(file), code=2)
     assert "the time budget does not fit: M_MOTION" in err
+
+
+def test_the_papers_system_is_listed_with_its_barriers(capsys):
+    listed, _ = said(capsys, "cut-sets", "paper")
+    assert "7 minimal cut sets" in listed
+    assert "fewer than two barriers:\n  erroneous_graph: only FTM1" in listed
+
+
+def test_counts_are_json_for_scripts(capsys):
+    out, _ = said(capsys, "cut-sets", "paper", "--count", "--json")
+    assert json.loads(out) == {
+        "format": 1, "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
+
+
+def test_what_is_exported_is_read_again(capsys, tmp_path):
+    file = tmp_path / "cell.xml"
+    said(capsys, "cut-sets", str(CELL), "--export", str(file))
+    there, back = (json.loads(said(capsys, "cut-sets", name, "--json")[0])
+                   for name in (str(CELL), str(file)))
+    assert [s["events"] for s in there["sets"]] == [s["events"] for s in back["sets"]]
+    assert there["by_size"] == back["by_size"]
+
+
+def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(refused, tmp_path):
+    file = tmp_path / "x.xml"
+    file.write_text("<!DOCTYPE x [<!ENTITY a 'b'>]><opsa-mef>&a;</opsa-mef>")
+    for more in ((), ("--export", "y.xml")):
+        assert "without document type definitions and entities" in refused("cut-sets", file, *more)
+
+
+def test_a_doubtful_file_is_analysed_with_a_warning(capsys, tmp_path):
+    file = tmp_path / "plant.xml"
+    file.write_text(
+        '<opsa-mef><define-fault-tree name="t"><define-gate name="top"><and>\n'
+        '<basic-event name="pump"/><basic-event name="pmup"/></and></define-gate>\n'
+        '<define-basic-event name="pump"/></define-fault-tree></opsa-mef>')
+    out, err = said(capsys, "cut-sets", str(file), "--count", "--json")
+    assert json.loads(out)["minimal_cut_sets"] == 1
+    (line,) = err.splitlines()
+    assert f"{file}:2: " in line
+    assert "pmup" in line
