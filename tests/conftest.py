@@ -37,8 +37,8 @@ WANTING = {
 is to be had."""
 
 
-VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_guards_alone.py",
-           "tests/whole/test_checkpointed_nodes.py", "tests/whole/test_verdict_anyway.py",
+VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_checkpointed_nodes.py",
+           "tests/whole/test_verdict_anyway.py",
            "tests/sim/campaign", "tests/manager/analysis", "tests/cli/analyse",
            "tests/actors/osmosis", "tests/actors/ros2/test_against_ros.py",
            "examples/nav2")

@@ -1,10 +1,11 @@
-"""The gateway beside nodes in rclpy, over DDS."""
+"""The gateway beside nodes in rclpy, over DDS; a lifecycle node that is killed again and again."""
 
 import asyncio
 import itertools
 import json
 import os
 import shutil
+import signal
 import sys
 import time
 
@@ -18,9 +19,8 @@ from rampart.actors.ros2.wire import UNKNOWN_GID, Qos
 from rampart.actors.supervision.kill_node import signal_node
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
-from tests.actors.ros2.test_against_ros import PYTHON, ROS
+from tests.actors.ros2.test_against_ros import PYTHON, ROS, Peer, check_passing, echoed
 from tests.actors.ros2.test_gateway import beside_foreign
-from tests.actors.ros2.test_live import Peer, check_passing, echoed
 from tests.actors.ros2.test_reports import REPORTS
 from tests.cli.look.test_ros_verbs import checked
 from tests.real_tools import printed
@@ -373,3 +373,61 @@ def test_the_check_without_rclpy_is_one_line_and_exit_code_2(refused, system, tm
     (tmp_path / "empty.bash").write_text("")
     error = refused("ros2", "check", "--system", system(setup="empty.bash"), "--json")
     assert "No module named 'rclpy'" in error
+
+
+KILLS = 10
+PAUSE_S = 1.0
+CAMERA = """
+[recovery.parameters]
+lifecycle = ["camera"]
+ask = ["camera/ask"]
+state = ["camera/state:current_state.id"]
+change = ["camera/change"]
+
+[[node]]
+name = "camera"
+command = ["sh", "-c", "exec {python} {peer} camera >> {log}"]
+kind = "non-control"
+respawn = "R_RESTART"
+
+[[ros2]]
+call = "/camera/get_state"
+type = "lifecycle_msgs/srv/GetState"
+from = "camera/ask"
+to = "camera/state"
+
+[[ros2]]
+call = "/camera/change_state"
+type = "lifecycle_msgs/srv/ChangeState"
+from = "camera/change"
+to = "camera/changed"
+"""
+
+
+@pytest.mark.slow
+def test_a_lifecycle_node_is_active_again_after_each_kill(tmp_path, system):
+    log = tmp_path / "log"
+    log.touch()
+
+    def active(state="active"):
+        told = map(json.loads, log.read_text().splitlines())
+        return [one["pid"] for one in told if state in (one.get("state"), *one)]
+
+    path = system()
+    parameters, rest = CAMERA.format(python=PYTHON, peer=PEER, log=log).split("\n[[node]]", 1)
+    respawn = 'actor = "rampart.actors.recovery.respawn:Respawn"\nkind = "masking"\n'
+    path.write_text(path.read_text().replace(
+        respawn, respawn.replace("recovery.respawn:Respawn",
+                                 "ros2.respawn_lifecycle:RespawnLifecycle")
+        + "deadline_s = 15.0\n" + parameters).replace(
+            '"driver", "gateway"]', '"driver", "gateway", "camera"]') + f"\n[[node]]{rest}")
+    with RealRun(tmp_path, path, "--rate", "1") as run:
+        run.wait_until(lambda: active("up"), 30, "it does not run")
+        (program,) = active("up")
+        for kill in range(KILLS):
+            os.kill(program, signal.SIGKILL)
+            run.wait_until(lambda kill=kill: len(active()) > kill, 20,
+                           f"kill {kill + 1}: it is not active")
+            assert len(active()) == kill + 1
+            program = active()[-1]
+            time.sleep(PAUSE_S)

@@ -1,15 +1,19 @@
-"""A gateway at a router of ROS 2 with TLS and access rules, that ends and starts again."""
+"""A gateway at a router of ROS 2: with TLS and access rules, and on another machine."""
 
 import asyncio
+import json
+import subprocess
+import sys
 import time
 
 import pytest
 
+from benchmarks.ros2_lost_machine import Reader, start
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import Tls, ZenohSide
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Qos
-from rampart.testing import RealRun, wait_until
+from rampart.testing import RealRun, free_port, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_gateway import configured
 from tests.cli.look.test_ros_verbs import (
@@ -22,6 +26,7 @@ from tests.cli.look.test_ros_verbs import (
     shown,
 )
 from tests.real_tools import printed
+from tests.whole.network import network, why_not
 
 pytestmark = pytest.mark.processes
 
@@ -128,3 +133,64 @@ async def test_the_listed_rules_are_enough_and_needed(tmp_path, listed):
         side.close()
     assert got == ({"odometry", "command", "graph", "map", "answer"} if listed is LISTED
                    else {"graph"})
+
+
+def on_ground(network, *words):
+    return subprocess.run(network.command("ground", sys.executable, *words), check=False,
+                          capture_output=True, text=True, timeout=60, cwd=ROOT)
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not())
+def test_a_client_exchanges_messages_and_the_check_knows_that_a_peer_does_not(tmp_path):
+    port, output = free_port(), tmp_path / "robot.txt"
+    path = tmp_path / "guarded.toml"
+    with network(["robot", "ground"]) as net, output.open("w") as out:
+        robot = net.addresses["robot"]
+        process = subprocess.Popen(net.command(
+            "robot", sys.executable, "-m", "tests.actors.ros2.far_robot", robot, str(port)),
+            stdout=out, cwd=ROOT)
+        try:
+            wait_until(lambda: "up" in output.read_text(), 20)
+            for mode, passes in (("client", True), ("peer", False)):
+                path.write_text(configured(connect=[f"tcp/{robot}:{port}"], mode=mode))
+                before = output.read_text().count("0.25")
+                done = on_ground(net, "-m", "tests.actors.ros2.far_robot", robot, str(port), mode)
+                assert (int(done.stdout) > 20) is passes, done.stderr
+                assert (output.read_text().count("0.25") > before + 20) is passes
+                done = on_ground(net, "-m", "rampart.cli.main", "ros2", "check", "--system",
+                                 str(path), "--json")
+                found = {one["what"]: one for one in json.loads(done.stdout)["findings"]}
+                assert done.returncode == int(not passes)
+                for what in ("subscribe /odom", "publish /cmd_vel"):
+                    assert found[what]["well"] is passes
+                    assert passes or 'mode = "client"' in found[what]["why"]
+        finally:
+            with process:
+                process.kill()
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not())
+@pytest.mark.alone
+def test_a_lost_machine_does_not_stop_the_messages_to_the_others():
+    with network(["robot", "ground", "far"]) as net:
+        port = free_port()
+        near, far = f"tcp/127.0.0.1:{port}", f"tcp/{net.addresses['robot']}:{port}"
+        parts = [start(net, "robot", "router", f"tcp/0.0.0.0:{port}", "rampart")]
+        try:
+            readers = {host: Reader(net, host, where, 10.0, "client") for host, where in (
+                ("robot", near), ("ground", far), ("far", far))}
+            parts += [one.process for one in readers.values()]
+            parts += [start(net, "robot", part, near) for part in ("base", "journal", "log")]
+            for one in readers.values():
+                wait_until(lambda one=one: len(one.lines) > 200, 30)
+            net.part(("robot", "far"), ("ground", "far"))  # 10 s before the router gives it up
+            counts = {host: len(one.lines) for host, one in readers.items()}
+            time.sleep(4.0)
+            came = {host: len(one.lines) - counts[host] for host, one in readers.items()}
+        finally:
+            for part in parts:
+                with part:
+                    part.kill()
+    assert came["far"] < 50
+    for host in ("robot", "ground"):
+        assert came[host] > 200, came  # of 400; with the settings of `rmw_zenohd` none
