@@ -21,8 +21,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.osmosis.page.map import MAX_LIGHTS
-from tests.actors.operator.page import show
-from tests.actors.operator.world import AIRPORT, SPEC, hear, open_page, repeated, served
+from tests.actors.operator.world import AIRPORT, SPEC, hear, open_page, repeated, served, show
 from tests.fuzz.message_extremes import filled
 
 MARKUP = "<img src=x onerror=window.broken=1><script>window.broken=1</script>"

@@ -1,21 +1,43 @@
-"""Who may use the page: logging in, cookies, withdrawn tokens, and what is kept of it all."""
+"""Who may use the page: tokens, cookies, roles, strangers, and what is kept of it all."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import os
 import socket
+from contextlib import asynccontextmanager
 
 import httpx
 import msgspec
 import pytest
 import websockets
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.requests import Request
+from rampart.actors.web import server as web_server
 from rampart.actors.web.audit import read_audit
-from rampart.actors.web.visitors import Role, issue
+from rampart.actors.web.door import user_of_peer
+from rampart.actors.web.visitors import Role, issue, revoke
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import Browser, browser
 from tests.actors.operator.test_operating import RELEASED, Hand
-from tests.actors.operator.world import TOKEN, ask, bearer, hear, open_page, served, visited
+from tests.actors.operator.world import (
+    LIVE,
+    SPEC,
+    TOKEN,
+    ask,
+    bearer,
+    hear,
+    open_page,
+    repeated,
+    served,
+    visited,
+)
+from tests.actors.web.pems import pair
 from tests.osmosis_system import shipped_system
+from tests.other_user import as_nobody, needs_root
 
 
 async def log_in(client: httpx.AsyncClient, token: object, **headers: str) -> httpx.Response:
@@ -250,3 +272,205 @@ async def test_what_a_role_lacks_the_server_refuses_and_nothing_happens(world, t
     if not asked:
         assert [*world.others.requests, *world.others.orders, *world.others.resets,
                 *world.others.adaptations, *world.others.injections] == []
+
+
+# -- In Chromium, over TLS: logging in, and what a role shows and takes away --
+
+
+ASKED = "$('#login').open"
+TEXT = "$('#login-text').textContent"
+WHY = "$$('.why-barred').filter((n) => !n.hidden && n.textContent)"
+
+
+def notes(kind: str = "") -> str:
+    return f"{WHY}.map((n) => n.textContent).filter((t) => t.includes('{kind}')).length"
+
+
+async def enter(tab: Browser, token: str) -> None:
+    """Type a token into the form, as a person does, and press Enter."""
+    await tab.until(ASKED)
+    await tab.value("$('#login-token').value = ''")
+    await tab.call("Input.insertText", text=token)
+    for kind in ("keyDown", "keyUp"):
+        await tab.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter",
+                       windowsVirtualKeyCode=13, text="\r")
+
+
+@pytest.fixture
+def encrypted(world, tmp_path):
+    """Return what shows the page of an HMI over TLS, in a world that speaks, in a tab."""
+    certificate, key = pair(tmp_path)
+
+    @asynccontextmanager
+    async def shown(**fields):
+        async with world.hmi(
+                hmi_host="0.0.0.0", hmi_cert=str(certificate), hmi_key=str(key), system=SPEC,
+                launcher_pid=1, faults=OsmosisFaults().offered(), **fields) as hmi, repeated(
+                world.others.busy, 0.05):
+            async with browser() as tab:
+                await tab.call("Security.setIgnoreCertificateErrors", ignore=True)
+                await tab.show(f"https://{await served(hmi)}/")
+                yield hmi, tab
+                assert tab.errors == []
+            await eventually(lambda: not hmi._server._server._state.connections)
+
+    return shown
+
+
+@pytest.mark.page
+async def test_one_logs_in_on_a_phone_stays_in_over_a_reload_until_revoked_and_logs_out(
+        encrypted, tmp_path):
+    file = tmp_path / "page.tokens"
+    who = "anna-of-the-control-room@airport.example"
+    token = issue(file, who, Role.LOOK)
+    async with encrypted(hmi_token_file=str(file)) as (hmi, tab):
+        await tab.show(f"https://{await served(hmi)}/", width=360, height=740)
+        await tab.until(f"{ASKED} && {TEXT} === 'Log in with your token.'")
+        assert await tab.value("document.documentElement.scrollWidth") == 360
+        box = "$('#login').getBoundingClientRect()"
+        assert await tab.value(f"{box}.left >= 0 && {box}.right <= 360") is True
+        await enter(tab, "wrong-wrong-wrong-wrong")
+        await tab.until(f"{TEXT} === 'unknown token.'")
+        await enter(tab, token)
+        await tab.until(f"{LIVE} && $$('#resets button').length === 1")
+        assert await tab.value("document.documentElement.scrollWidth") == 360
+        assert await tab.value("document.cookie") == ""  # scripts do not see it
+        assert await tab.value("JSON.stringify([{...localStorage}, {...sessionStorage}])"
+                               f".includes('{token}')") is False
+        assert await tab.value("$('#login-token').value") == ""
+        assert await tab.value("$('#visitor').textContent") == f"{who} · look"
+        await tab.until("$('#credentials').textContent"
+                        ".includes('days left')")  # the page's certificate expires first
+        await tab.value("window.before = true")
+        await tab.call("Page.reload")
+        await tab.until(f"window.before === undefined && {LIVE} && $('#inject').inert")
+        revoke(file, who)
+        await tab.until(f"{ASKED} && {TEXT}.startsWith('Your token was revoked')")
+        await enter(tab, issue(file, who, Role.INJECT))
+        await tab.until(f"{LIVE} && !$('#inject').inert")
+        assert await tab.value(notes()) == 0
+        await tab.value("$('#logout').click()")
+        await tab.until(ASKED)
+        await tab.call("Page.reload")
+        await tab.until(f"document.readyState === 'complete' && {ASKED}")
+        assert [url for url in tab.requests if token in url] == []
+        tab.errors[:] = [e for e in tab.errors if "403" not in e]  # it logs the wrong token
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("role", Role)
+async def test_what_a_role_lacks_is_out_of_use_and_says_why(world, encrypted, tmp_path, role):
+    file = tmp_path / "page.tokens"
+    token = issue(file, "anna", role)
+    drives, injects = role.may(Role.DRIVE), role.may(Role.INJECT)
+    async with encrypted(hmi_token_file=str(file)) as (_, tab):
+        await enter(tab, token)
+        await tab.until(LIVE)
+        await tab.until("$$('#resets button').length === 1")
+        await tab.until("$$('tr[data-node] button.signal').length > 0")
+        await tab.until("$('.stick-state').textContent !== 'not connected'")
+        assert await tab.value("$('#visitor').textContent") == (f"anna · {role}")
+        for part, may in (("#resets", drives), (".stick-row", drives), ("#inject", injects),
+                          ("#strategy", injects), ("div:has(> #orders)", drives)):
+            assert await tab.value(f"$('{part}').inert") is not may, part
+        assert await tab.value(notes("Needs the role drive")) == (0 if drives else 3)
+        assert await tab.value(notes("Needs the role inject")) == (0 if injects else 3)
+        seen = "getComputedStyle($('button.signal')).display !== 'none'"
+        assert await tab.value(seen) is injects
+        await tab.value("$('#resets button').click()")  # as a script would
+        await tab.value("$('.stick').focus()")
+        await tab.call("Input.dispatchKeyEvent", type="rawKeyDown", key="ArrowUp", code="ArrowUp")
+        if drives:
+            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
+            await eventually(lambda: any(s.dead_man for s in world.others.stick))
+        else:
+            why = f"Needs the role drive; anna has the role {role}"
+            await tab.until(f"$('#toast').textContent === '{why}'")
+            assert world.others.resets == []
+            assert not any(s.dead_man for s in world.others.stick)
+            assert await tab.value("$('.stick-state').textContent") == ("not permitted")
+        await tab.call("Input.dispatchKeyEvent", type="keyUp", key="ArrowUp", code="ArrowUp")
+
+
+# -- Strangers: other users of this machine, too many connections --
+
+
+@pytest.mark.usefixtures("patient")
+async def test_beyond_so_many_connections_requests_are_refused_and_an_open_page_drives_on(
+        world, monkeypatch):
+    monkeypatch.setattr(web_server, "ROOM", 8)
+    async with world.hmi(hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        async with open_page(at, TOKEN) as page:
+            hand = Hand(page)
+            await hand.take()
+            with contextlib.ExitStack() as idle:
+                host, port = at.split(":")
+                for _ in range(10):
+                    idle.enter_context(socket.create_connection((host, int(port))))
+                async with httpx.AsyncClient() as client:
+                    await eventually(lambda: len(hmi._server._server._state.connections) > 8)
+                    assert (await client.get(f"http://{at}/")).status_code == 503
+                assert (await hand.hold(0.25))["drives"]
+            await hand.let_go()
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+
+
+# ---- other users of this machine ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::ffff:127.0.0.1"])
+def test_the_kernel_tells_whose_a_connection_is_and_of_a_closed_one_nothing(host):
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server(("::", 0), family=socket.AF_INET6, dualstack_ipv6=True) as listening:
+        with socket.socket(family) as client:
+            client.connect((host, listening.getsockname()[1]))
+            served_, peer = listening.accept()
+        with served_:
+            assert user_of_peer(served_.getsockname()[:2], peer[:2]) is None
+        with socket.create_connection((host, listening.getsockname()[1])):
+            served_, peer = listening.accept()
+            with served_:
+                assert user_of_peer(served_.getsockname()[:2], peer[:2]) == os.getuid()
+
+
+async def output(process) -> str:
+    told, _ = await asyncio.to_thread(process.communicate)
+    assert process.returncode == 0
+    return told
+
+
+def request(path: str, *headers: str) -> str:
+    """Return code that sends a request over the connection `c`."""
+    head = "\\r\\n".join((f"GET {path} HTTP/1.1", "Host: ", ""))
+    more = "\\r\\n".join((*headers, "", ""))
+    return f'c = connect(); c.sendall(b"{head[:-4]}" + sys.argv[1].encode() + b"\\r\\n{more}")'
+
+
+@needs_root
+async def test_another_user_who_is_gone_before_it_is_looked_at_is_not_taken_for_root(hmi):
+    """Of a socket without a process the kernel says that it is user 0's, who runs this test."""
+    upgrade = request("/ws", "Upgrade: websocket", "Connection: Upgrade",
+                      "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")
+    seen = []
+    handlers = hmi._server._handlers
+    hmi._server._handlers = msgspec.structs.replace(
+        handlers, came=lambda page: (seen.append(page), handlers.came(page))[1])
+    code = f"for _ in range(200): {upgrade}; c.close()"
+    assert await output(as_nobody(await served(hmi), code)) == ""
+    assert seen == []
+
+
+@needs_root
+async def test_another_user_is_refused_in_one_clear_line_and_let_in_by_a_token(world):
+    needs = "403 Forbidden\n"
+    for token, path, header, status in (
+            ("", "/", "A: b", needs), (TOKEN, "/", "A: b", "200 OK\n"),
+            (TOKEN, "/other", f"Authorization: Bearer {TOKEN}", "404 ")):
+        async with world.hmi(hmi_token=token) as hmi:
+            code = f'{request(path, "Connection: close", header)}; print(told(c))'
+            told = await output(as_nobody(await served(hmi), code))
+        assert told.startswith(f"HTTP/1.1 {status}")
+        assert ("Other users need a token: launch.py --hmi-token-file FILE." in told) == (
+            status == needs)

@@ -20,8 +20,7 @@ from rampart.actors.osmosis.page.map import MAX_PATHS_BYTES, page_map
 from rampart.manager.model.mechanisms import Clears
 from rampart.testing import free_port
 from tests.actors.operator.browser import mouse
-from tests.actors.operator.page import LIVE, events, page, show, text
-from tests.actors.operator.world import SPEC, repeated
+from tests.actors.operator.world import LIVE, SPEC, events, page, repeated, show, text
 from tests.actors.osmosis.airport.large import WIDE_M, write_large_airport
 
 pytestmark = pytest.mark.page

@@ -17,9 +17,8 @@ from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser, mouse
-from tests.actors.operator.page import LIVE, show
 from tests.actors.operator.test_operating import RELEASED
-from tests.actors.operator.world import World, repeated
+from tests.actors.operator.world import LIVE, World, repeated, show
 from tests.osmosis_system import shipped_system
 
 pytestmark = pytest.mark.page

@@ -10,10 +10,9 @@ import pytest
 from rampart.actors.operator.panels import Panel
 from rampart.testing import eventually
 from tests.actors.operator.browser import mouse
-from tests.actors.operator.page import LIVE, page, show
 from tests.actors.operator.test_page_operating import key
 from tests.actors.operator.test_panels import AT_REST, DRIVE, PANELS, Speaks, driven, hmi, rests
-from tests.actors.operator.world import repeated
+from tests.actors.operator.world import LIVE, page, repeated, show
 from tests.tank import LEVEL, PUMP, VALVE, Hand, Level, Phase, Pump, Valve
 
 pytestmark = pytest.mark.page

@@ -241,7 +241,6 @@ def test_a_robot_s_files_are_served_beside_the_page_s_which_know_no_robot():
 
 
 FIELDS = 'stick = ["tank/hand:forward", "tank/hand:left"]'
-HELD = 'held = "tank/hand:held"'
 DRIVE = Panel(title="Drive", stick=("tank/hand:forward", "tank/hand:left"), held="tank/hand:held",
               scale=(0.5, -4.0))
 AT_REST = Hand(0.0)

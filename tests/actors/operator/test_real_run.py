@@ -17,8 +17,8 @@ from websockets.sync.client import connect
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
 from tests.actors.operator.browser import browser
-from tests.actors.operator.page import text
 from tests.actors.operator.test_page_operating import key
+from tests.actors.operator.world import text
 from tests.actors.web.pems import pair
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]

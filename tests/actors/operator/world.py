@@ -33,6 +33,7 @@ FILE = system_file("osmosis")
 SPEC = parse_specification(FILE.read_text(encoding="utf-8"), FILE.name)
 RATE = 20.0
 TOKEN = "abcdefghijklmnop"
+LIVE = "$('#link').textContent === 'live'"
 
 
 NOTED = {"requests": topics.MISSION_REQUEST, "resets": ftm_topics.RESET,
@@ -196,3 +197,30 @@ async def hear(page, *kinds: str) -> dict:
                 message = dict(known)
             if message["type"] in kinds:
                 return message
+
+
+# -- The page on an HMI in a real Chromium --
+
+
+async def show(tab, hmi, **look) -> None:
+    """Show the page of an HMI."""
+    await tab.show(f"http://{await served(hmi)}/", **look)
+    await tab.until(LIVE)
+
+
+@asynccontextmanager
+async def page(world: World, tab, airport=AIRPORT, system=SPEC, **look):
+    """Show the page of an HMI that knows the system and an airport."""
+    async with world.hmi(system=system, airport=airport) as hmi:
+        await show(tab, hmi, **look)
+        await tab.until("$$('#tree .event').length > 0")
+        yield hmi
+
+
+def text(name: str) -> str:
+    """Return an expression for the text of an element with an id."""
+    return f"$('#{name}').textContent"
+
+
+def events(kind: str) -> str:
+    return f"$$('#tree .event.{kind} .ftm').map((t) => t.textContent).join()"

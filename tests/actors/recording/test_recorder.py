@@ -38,13 +38,7 @@ from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
 from rampart.testing import HEEDS_SIGNALS, RealRun, wait_until
 from tests import ROOT
-from tests.actors.recording.samples import (
-    AnsweringLauncher,
-    documents,
-    pid_of,
-    pose,
-    running,
-)
+from tests.actors.recording.samples import AnsweringLauncher, documents, pid_of, pose, running
 
 
 def numbers(path):

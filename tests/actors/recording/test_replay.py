@@ -10,8 +10,10 @@ import subprocess
 import sys
 import time
 import urllib.request
+from types import SimpleNamespace
 
 import msgspec
+import mujoco
 import pytest
 from websockets.asyncio.client import connect as open_socket
 
@@ -25,6 +27,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.requests import REQUESTS, ResetRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.recording.bag_reader import BagReader, key_of
 from rampart.actors.recording.bag_writer import BagWriter
@@ -34,22 +37,12 @@ from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli.main import main
 from rampart.cli.output import UsageError
 from rampart.cli.record import replaying
-from rampart.cli.record.replaying import Replay
+from rampart.cli.record.replaying import HEIGHT, WIDTH, RecordedRun, Replay, Stage
 from rampart.cli.session import connect
 from rampart.systems import SHIPPED
 from rampart.testing import HEEDS_SIGNALS, eventually, free_base_port, wait_until
 from tests import ROOT as HERE
-from tests.actors.recording.samples import (
-    AnsweringLauncher,
-    documents,
-    pose,
-    sample,
-    write,
-)
-
-form_of = Forms(topics.ALL).of
-
-STRANGE = f"{ROOT}/no/such/topic"
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
 
 
 @contextlib.asynccontextmanager
@@ -304,3 +297,84 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port, monkeypa
     assert ("map" in told["hello"]) is (written is of_osmosis)
     assert set(told["visitor"]["barred"]) >= {str(kind.__struct_config__.tag) for kind in REQUESTS}
     assert main(["bag", "info", str(tmp_path / "run.mcap")]) == 0
+
+
+# -- In MuJoCo: as a video, which another program reads, and in the viewer --
+
+
+def test_a_video_has_a_frame_each_25th_of_a_second_and_the_robot_moves(recording):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = recording.with_suffix(".mp4")
+    done = subprocess.run(
+        [sys.executable, "-m", "rampart.cli.main", "replay", str(recording), "--video", str(path),
+         "--rate", "8"], cwd=HERE, capture_output=True, text=True, check=False, timeout=100)
+    if done.returncode == 1 and "cannot render" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    pixels = subprocess.run(
+        [ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "gray",
+         "-"], capture_output=True, check=True).stdout
+    size = WIDTH * HEIGHT
+    assert len(pixels) == 4 * size  # of 0.95 s, each 0.32 s, and the last message
+    assert pixels[:size] != pixels[-size:]
+
+
+def test_the_model_stands_where_the_messages_put_it_and_ignores_what_is_no_pose(recording):
+    stage = Stage(RecordedRun(recording))
+    for number, yaw_rad in ((7, 0.5), (8, float("nan"))):
+        stage.take(*pose(number, 0.1, yaw_rad)[1:])
+    stage.take(topics.POSE.at(), b"\xc1")
+    stage.take("rampart/no/such/topic", b"")
+    assert stage.robot.data.qpos[0] == 7.0
+
+
+@pytest.mark.parametrize(("words", "told"), [
+    (["--video", "run.avi"], "--video run.avi: expected a name that ends in .mp4"),
+    (["--video", "there.mp4"], "--video there.mp4: exists already"),
+    (["--video", "no/such/place.mp4"], "there is no such directory"),
+    (["--video", "new.mp4", "--viewer"], "--video new.mp4: plays nothing")])
+def test_a_video_that_cannot_be_is_refused_in_one_line(
+        recording, monkeypatch, refused, words, told):
+    monkeypatch.chdir(recording.parent)
+    recording.with_name("there.mp4").touch()
+    assert told in refused("replay", recording, *words)
+
+
+def test_a_machine_that_cannot_render_and_a_robot_without_a_model_are_told(
+        recording, monkeypatch, capsys):
+    def fail(*_):
+        raise RuntimeError("no\nEGL")
+
+    path = recording.with_suffix(".mp4")
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    assert main(["replay", str(recording), "--video", str(path)]) == 1
+    assert "cannot render" in capsys.readouterr().err
+    assert not path.exists()
+    monkeypatch.setattr(Osmosis, "model", "")
+    assert main(["replay", str(recording), "--video", str(path)]) == 2
+    assert "has no model for MuJoCo" in capsys.readouterr().err
+
+
+def test_the_viewer_shows_what_is_played_and_a_closed_window_ends_the_replay(
+        recording, monkeypatch, capsys):
+    import glfw
+    import mujoco.viewer
+
+    shown = []
+
+    def launch(_model, data, **_):
+        return SimpleNamespace(
+            lock=contextlib.nullcontext, cam=SimpleNamespace(), close=lambda: shown.append("end"),
+            opt=mujoco.MjvOption(), sync=lambda: shown.append(float(data.qpos[0])),
+            is_running=lambda: len(shown) < 5)
+
+    replay = ["replay", str(recording), "--viewer", "--port", str(free_base_port())]
+    monkeypatch.setattr(glfw, "init", lambda: False)
+    assert main(replay) == 1
+    assert "--viewer: no window can be opened" in capsys.readouterr().err
+    monkeypatch.setattr(glfw, "init", lambda: True)
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    assert main(replay) == 0
+    assert shown[-1] == "end"
+    assert sorted(shown[:-1]) == shown[:-1]
+    assert len(set(shown)) > 3
