@@ -26,19 +26,7 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.testing import Ear, play, table
-from tests.actors.osmosis.control.localization_drive import (
-    END_S,
-    STAMPED,
-    Accused,
-    Truth,
-    Voted,
-    disturbed,
-    drive,
-    fault,
-    honest,
-    mis_stamped,
-    watch,
-)
+from tests.actors.osmosis.control import localization_drive as trip
 from tests.osmosis_system import in_system, shipped_system
 
 LANE = Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
@@ -168,17 +156,18 @@ async def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system(syst
 FROM_S = 4.0
 
 
-def follow(*faults, blind_s=10.0, blind_m=5.0) -> Voted:
-    voted = Voted(VotedPosition(0.05, blind_s, blind_m))
-    watch(disturbed(faults), voted)
+def follow(*faults, blind_s=10.0, blind_m=5.0) -> trip.Voted:
+    voted = trip.Voted(VotedPosition(0.05, blind_s, blind_m))
+    trip.watch(trip.disturbed(faults), voted)
     return voted
 
 
-@pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("topic", trip.STAMPED, ids=lambda topic: topic.key)
 def test_one_wrong_stamp_is_over_when_another_source_fails_later(topic):
     later = "absolute-pose-bias" if topic is topics.GPS else "gps-bias"
-    items, voted = disturbed([(fault(later), FROM_S + 4.0, math.inf)]), Voted()
-    watch(mis_stamped(items, topic, "far ahead", FROM_S, once=True), voted, to_s=FROM_S + 10.0)
+    items, voted = trip.disturbed([(trip.fault(later), FROM_S + 4.0, math.inf)]), trip.Voted()
+    items = trip.mis_stamped(items, topic, "far ahead", FROM_S, once=True)
+    trip.watch(items, voted, to_s=FROM_S + 10.0)
     assert voted.worst_m < 0.4
     assert voted.unknown_s < 0.45
 
@@ -187,18 +176,19 @@ def test_one_wrong_stamp_is_over_when_another_source_fails_later(topic):
     ("gps-stuck", "absolute-pose-dropout"), ("gps-bias", "absolute-pose-bias"),
     ("gps-dropout", "odom-dropout"), ("absolute-pose-dropout", "odom-dropout")])
 def test_after_two_faults_it_knows_nothing_beyond_the_bound_rather_than_something_wrong(names):
-    voted = follow(*((fault(name), FROM_S + 3.0 * i, math.inf) for i, name in enumerate(names)))
+    voted = follow(*((trip.fault(name), FROM_S + 3.0 * i, math.inf)
+                     for i, name in enumerate(names)))
     assert voted.worst_m < 0.6
     assert voted.unknown_s > 3.0
 
 
 def test_how_long_and_how_far_it_goes_on_blind_is_bounded():
-    both = [(fault(name), FROM_S, math.inf) for name in ("gps-dropout", "absolute-pose-dropout")]
+    both = [(trip.fault(f"{name}-dropout"), FROM_S, math.inf) for name in ("gps", "absolute-pose")]
     by_way = follow(*both, blind_s=1000.0, blind_m=2.0).unknown_s
     by_time = follow(*both, blind_s=1.0, blind_m=1000.0).unknown_s
     never = follow(*both, blind_s=1000.0, blind_m=1000.0)
-    assert END_S - FROM_S - 4.0 < by_way < by_time
-    assert by_time == pytest.approx(END_S - FROM_S - 1.0, abs=0.5)
+    assert trip.END_S - FROM_S - 4.0 < by_way < by_time
+    assert by_time == pytest.approx(trip.END_S - FROM_S - 1.0, abs=0.5)
     assert never.unknown_s < 0.3
     assert never.worst_m < 0.6
 
@@ -306,14 +296,14 @@ async def test_the_actor_needs_two(system, gps_y_m, pose_y_m, expected):
 
 # ---- DM8: faults of other sources do not count as its own ----------------------------------------
 
-def accusations(lie=honest, to_s=END_S, monitor=None) -> list[tuple[float, float]]:
-    accused = Accused(lie, monitor or EstimationMonitor(-math.inf))
-    watch(disturbed([]), accused, to_s=to_s)
+def accusations(lie=trip.honest, to_s=trip.END_S, monitor=None) -> list[tuple[float, float]]:
+    accused = trip.Accused(lie, monitor or EstimationMonitor(-math.inf))
+    trip.watch(trip.disturbed([]), accused, to_s=to_s)
     return accused.spans
 
 
 def lying(x_m=0.0, y_m=0.0, yaw_rad=0.0, *, per_s=False, to_s=math.inf):
-    def lie(truth: Truth, now_s: float) -> m.Pose:
+    def lie(truth: trip.Truth, now_s: float) -> m.Pose:
         share = 0.0
         if FROM_S <= now_s < to_s:
             share = now_s - FROM_S if per_s else 1.0
@@ -324,7 +314,7 @@ def lying(x_m=0.0, y_m=0.0, yaw_rad=0.0, *, per_s=False, to_s=math.inf):
 
 
 def test_a_localization_that_is_silent_is_not_accused():
-    assert accusations(lambda t, now_s: honest(t, now_s) if now_s < FROM_S else None) == []
+    assert accusations(lambda t, now_s: trip.honest(t, now_s) if now_s < FROM_S else None) == []
 
 
 @pytest.mark.parametrize(("lie", "within_s"), [
@@ -345,14 +335,14 @@ def test_a_lie_is_found_out_in_time_and_forgiven_when_it_ends(lie, within_s):
 def test_a_pose_that_is_stuck_with_fresh_stamps_is_found_out_within_half_a_metre():
     kept: list[m.Pose] = []
 
-    def stuck(truth: Truth, now_s: float) -> m.Pose:
+    def stuck(truth: trip.Truth, now_s: float) -> m.Pose:
         if now_s < FROM_S:
-            return honest(truth, now_s)
-        kept.append(honest(truth, now_s))
+            return trip.honest(truth, now_s)
+        kept.append(trip.honest(truth, now_s))
         return kept[0]
 
     (since_s, _), *_ = accusations(stuck, FROM_S + 3.0)
-    truth = next(t for t in drive() if isinstance(t, Truth) and t.stamp_s >= since_s)
+    truth = next(t for t in trip.drive() if isinstance(t, trip.Truth) and t.stamp_s >= since_s)
     assert math.dist((truth.x_m, truth.y_m), (kept[0].x_m, kept[0].y_m)) < 0.55
 
 

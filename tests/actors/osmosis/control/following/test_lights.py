@@ -16,7 +16,7 @@ from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimi
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
 from tests.actors.osmosis.control.world import DT_S, Circle, World, drive
 
-WAY = ((0.0, 0.0), (20.0, 0.0))
+WAY = ((0.0, 0.0), (30.0, 0.0))
 
 
 def light_row(count=6, spacing_m=3.0):
@@ -59,7 +59,38 @@ def test_the_robot_waits_for_an_obstacle_and_resumes_a_moment_after_it_is_gone()
     world.circles.clear()
     assert drive(world, row, 0.9).linear_mps == 0.0, "free for less than a second"
     assert drive(world, row, 0.5).linear_mps > 0.0
-    assert drive(world, row, 40).arrived
+    assert drive(world, row, 60).arrived
+
+
+def passing_row(pass_after_s=5.0, half_width_m=2.75):
+    return LightRow(WAY, limits=RowLimits(pass_after_s=pass_after_s),
+                    edge_m=lambda _x, y: half_width_m - abs(y))
+
+
+@pytest.mark.parametrize("aside_m", [-0.4, 0.0])
+def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_behind_it(aside_m):
+    world = World(circles=[Circle(12.0, aside_m, 0.4)])
+    motion = drive(world, passing_row(), 70.0)
+    assert motion.arrived
+    assert world.least_clearance_m >= 0.2
+    assert max(abs(y) for _, y in world.track) <= 1.45
+    behind = [abs(y) for x, y in world.track if x > 16.0]
+    assert behind
+    assert max(behind) <= 0.25, "on the row again soon"
+
+
+@pytest.mark.parametrize(("follower", "aside_m"), [
+    (lambda: LightRow(WAY), (0.0,)), (lambda: passing_row(half_width_m=1.3), (0.0,)),
+    (passing_row, (-2.0, -1.0, 0.0, 1.0, 2.0))],
+    ids=["as in the paper", "no room on the pavement", "both sides are blocked"])
+def test_else_it_waits_and_touches_nothing(follower, aside_m):
+    world = World(circles=[Circle(12.0, y_m, 0.4) for y_m in aside_m])
+    motion = drive(world, follower(), 30.0)
+    assert not motion.arrived
+    assert motion.linear_mps == 0.0
+    assert world.least_clearance_m >= 0.2
+    if len(aside_m) == 1:
+        assert max(abs(y) for _, y in world.track) < 0.05
 
 
 def test_a_standby_goes_back_where_the_active_one_does_and_stops_when_it_does():

@@ -20,23 +20,7 @@ from rampart.actors.osmosis.control.localization.pose_filter import FilterLimits
 from rampart.actors.osmosis.motion_check import TURNING_TRACK_M, WHEEL_RADIUS_M, MotionParity
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from tests.actors.osmosis.control.localization_drive import (
-    END_S,
-    SOURCES,
-    STAMPED,
-    WRONG_STAMPS,
-    Accused,
-    Located,
-    Reading,
-    Voted,
-    disturbed,
-    fault,
-    field_airport,
-    mis_stamped,
-    sensor_faults,
-    watch,
-    with_absurd,
-)
+from tests.actors.osmosis.control import localization_drive as trip
 from tests.osmosis_system import in_system, shipped_system
 
 FROM_S, FOR_EVER = 4.0, math.inf
@@ -45,10 +29,10 @@ BOUND_M = 0.15
 """Of the true error under any single fault of a source; docs/case-study/localization.md."""
 
 
-def run(*faults, seed=1, limits=None, owed_m=0.0, **judged) -> Located:
+def run(*faults, seed=1, limits=None, owed_m=0.0, **judged) -> trip.Located:
     """Drive with faults, (name, from s, to s)."""
-    located = Located(PoseFilter(limits, owed_m), **judged)
-    watch(disturbed([(fault(name), a, b) for name, a, b in faults], seed), located)
+    located = trip.Located(PoseFilter(limits, owed_m), **judged)
+    trip.watch(trip.disturbed([(trip.fault(name), a, b) for name, a, b in faults], seed), located)
     return located
 
 
@@ -58,12 +42,12 @@ def run(*faults, seed=1, limits=None, owed_m=0.0, **judged) -> Located:
 @pytest.mark.parametrize("seed", [
     1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (2, 3))])
 def test_without_a_fault_all_are_right_to_a_few_centimetres_and_exclude_nobody(seed):
-    located, voted, accused = Located(), Voted(), Accused()
-    watch(disturbed([], seed), located, voted, accused)
+    located, voted, accused = trip.Located(), trip.Voted(), trip.Accused()
+    trip.watch(trip.disturbed([], seed), located, voted, accused)
     assert (located.excluded, accused.spans, located.lost_s) == (set(), [], 0.0)
     assert located.worst_m < 0.03
     assert located.worst_rad < 0.02
-    assert located.told > 20 * (END_S - 1)
+    assert located.told > 20 * (trip.END_S - 1)
     assert voted.worst_m < 0.06
     assert voted.unknown_s < 0.15
 
@@ -119,7 +103,7 @@ MOTION = ("odom-stuck", "odom-drift", "imu-stuck", "imu-slow-drift", "encoders-s
 """One wrong measurement of motion does not silence two good positions."""
 
 
-def assert_borne(located: Located, voted: Voted, accused: Accused) -> None:
+def assert_borne(located: trip.Located, voted: trip.Voted, accused: trip.Accused) -> None:
     assert located.worst_m < BOUND_M
     assert located.worst_rad < 0.1
     assert located.lost_s < 0.11
@@ -128,14 +112,14 @@ def assert_borne(located: Located, voted: Voted, accused: Accused) -> None:
     assert accused.spans == []
 
 
-@pytest.mark.parametrize("name", sensor_faults(*SOURCES))
+@pytest.mark.parametrize("name", trip.sensor_faults(*trip.SOURCES))
 @pytest.mark.parametrize("how", ["permanent", *(
     pytest.param(how, marks=pytest.mark.nightly) for how in ("transient", "intermittent"))])
 def test_any_single_fault_of_a_source_is_borne_by_all_who_read_it(name, how):
-    what = fault(name, on_s=0.7, off_s=1.6) if how == "intermittent" else fault(name)
-    located, voted, accused = Located(), Voted(), Accused()
+    what = trip.fault(name, on_s=0.7, off_s=1.6) if how == "intermittent" else trip.fault(name)
+    located, voted, accused = trip.Located(), trip.Voted(), trip.Accused()
     until_s = 14.0 if how == "transient" else FOR_EVER
-    watch(disturbed([(what, FROM_S, until_s)]), located, voted, accused)
+    trip.watch(trip.disturbed([(what, FROM_S, until_s)]), located, voted, accused)
     assert_borne(located, voted, accused)
     if how == "permanent" and name in EXCLUDED:
         assert located.excluded == {EXCLUDED[name]}
@@ -146,19 +130,20 @@ def test_any_single_fault_of_a_source_is_borne_by_all_who_read_it(name, how):
 @pytest.mark.parametrize("wrong", [
     "far ahead", "no number",
     *(pytest.param(wrong, marks=pytest.mark.nightly) for wrong in ("ahead", "infinite"))])
-@pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("topic", trip.STAMPED, ids=lambda topic: topic.key)
 def test_stamps_of_no_possible_time_are_borne_like_any_other_fault(topic, wrong):
-    located, voted, accused = Located(), Voted(), Accused()
-    watch(mis_stamped(disturbed([]), topic, wrong, FROM_S, once=False), located, voted, accused)
+    located, voted, accused = trip.Located(), trip.Voted(), trip.Accused()
+    items = trip.mis_stamped(trip.disturbed([]), topic, wrong, FROM_S, once=False)
+    trip.watch(items, located, voted, accused)
     assert_borne(located, voted, accused)
 
 
-@pytest.mark.parametrize("wrong", WRONG_STAMPS)
-@pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("wrong", trip.WRONG_STAMPS)
+@pytest.mark.parametrize("topic", trip.STAMPED, ids=lambda topic: topic.key)
 def test_a_source_is_silent_when_it_falls_silent_after_a_stamp_of_no_possible_time(topic, wrong):
-    located, wrong_s = Located(), math.inf
-    for now_s, item in mis_stamped(disturbed([]), topic, wrong, FROM_S, once=True):
-        if isinstance(item, Reading) and (item.topic is not topic or now_s <= wrong_s):
+    located, wrong_s = trip.Located(), math.inf
+    for now_s, item in trip.mis_stamped(trip.disturbed([]), topic, wrong, FROM_S, once=True):
+        if isinstance(item, trip.Reading) and (item.topic is not topic or now_s <= wrong_s):
             wrong_s = now_s if item.topic is topic and now_s >= FROM_S else wrong_s
             located.take(now_s, item)
         if now_s > 6.0:
@@ -166,11 +151,11 @@ def test_a_source_is_silent_when_it_falls_silent_after_a_stamp_of_no_possible_ti
     assert [reason for _, reason in located.filter.status(6.0).excluded] == ["silent or late"]
 
 
-@pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("topic", trip.STAMPED, ids=lambda topic: topic.key)
 def test_one_reading_beyond_all_measure_neither_ends_them_nor_stays_in_them(topic):
-    located, voted = Located(judge_to_s=FROM_S + 4.0), Voted()
-    items = disturbed([(fault("absolute-pose-dropout"), FROM_S + 4.0, FOR_EVER)])
-    watch(with_absurd(items, topic, FROM_S), located, voted)
+    located, voted = trip.Located(judge_to_s=FROM_S + 4.0), trip.Voted()
+    items = trip.disturbed([(trip.fault("absolute-pose-dropout"), FROM_S + 4.0, FOR_EVER)])
+    trip.watch(trip.with_absurd(items, topic, FROM_S), located, voted)
     assert located.worst_m < 0.03
     assert located.excluded == set()
     assert voted.worst_m < 0.4
@@ -179,11 +164,11 @@ def test_one_reading_beyond_all_measure_neither_ends_them_nor_stays_in_them(topi
 
 @pytest.mark.parametrize("name", ["gps-bias", "imu-drift", "odom-stuck", "absolute-pose-drift"])
 def test_a_source_that_has_recovered_is_used_again(name):
-    located, items = Located(), disturbed([(fault(name), 3.0, 12.0)])
-    watch(items, located, to_s=9.0)
+    located, items = trip.Located(), trip.disturbed([(trip.fault(name), 3.0, 12.0)])
+    trip.watch(items, located, to_s=9.0)
     assert len(located.filter.status(9.0).in_use) == 3
-    watch(items, located)
-    assert len(located.filter.status(END_S).in_use) == 4
+    trip.watch(items, located)
+    assert len(located.filter.status(trip.END_S).in_use) == 4
 
 
 # ---- two faults: it may not know, it must not be wrong -------------------------------------------
@@ -193,7 +178,7 @@ def test_without_both_positions_it_dead_reckons_with_growing_uncertainty_and_the
     lost = (("gps-dropout", 3.0, FOR_EVER), ("absolute-pose-dropout", 3.0, FOR_EVER))
     located = run(*lost)
     assert located.bridged_m > 10.0
-    assert 4.0 < located.lost_s < END_S - 12.0
+    assert 4.0 < located.lost_s < trip.END_S - 12.0
     assert located.worst_m < 0.5
     assert run(*lost, limits=FilterLimits(bridge_m=2.0)).lost_s > located.lost_s + 5.0
     back = [(name, since_s, 24.0) for name, since_s, _ in lost]
@@ -212,8 +197,8 @@ def test_after_two_faults_it_is_roughly_right_or_says_nothing(names):
 @pytest.mark.parametrize("way", ["stuck", "stuck-noise", "drift", "slow-drift"])
 def test_two_positions_that_are_wrong_alike_leave_them_silent_and_a_successor_too(way):
     alike = ((f"gps-{way}", FROM_S, FOR_EVER), (f"absolute-pose-{way}", FROM_S, FOR_EVER))
-    first, voted = Located(), Voted()
-    watch(disturbed([(fault(name), a, b) for name, a, b in alike]), first, voted)
+    first, voted = trip.Located(), trip.Voted()
+    trip.watch(trip.disturbed([(trip.fault(name), a, b) for name, a, b in alike]), first, voted)
     assert first.worst_m < 0.6
     assert first.lost_s > 5.0
     assert first.filter.owed_m > 0.0
@@ -271,7 +256,7 @@ def test_the_filter_is_the_textbook_one(moves):
 
 # ---- the nodes, on the bus with the simulated robot ----------------------------------------------
 
-FIELD = {"system": shipped_system(), "airport": field_airport()}
+FIELD = {"system": shipped_system(), "airport": trip.field_airport()}
 
 
 @in_system(**FIELD)

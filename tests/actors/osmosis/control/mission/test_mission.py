@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.control.mission import mission_state as ms
 from rampart.actors.osmosis.control.mission.mission_state import MissionState
-from rampart.actors.osmosis.control.teleoperation.teleoperation import stick_twist
 from rampart.actors.osmosis.messages import ControlPhase, ControlStatus, MissionPhase, Mode
 
 GOALS = (m.Goal(1.0, 0.0, Mode.TAXI), m.Goal(9.0, 0.0, Mode.LIGHT_VERIFICATION))
@@ -261,12 +260,3 @@ def test_no_order_ever_raises_and_the_phase_always_tells_whether_the_robot_has_a
             assert not state.skipped
             assert not state.homing
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(state), type=MissionState) == state
-
-
-@pytest.mark.parametrize(("stick", "expected"), [
-    (m.Joystick(-0.5, 0.5, True), m.StickTwist(-0.4, 0.5)),
-    (m.Joystick(7.0, -7.0, True), m.StickTwist(0.8, -1.0)),
-    (m.Joystick(1.0, 0.0, False), None),
-    (m.Joystick(float("nan"), 0.0, True), None)])
-def test_the_stick_is_a_velocity_only_while_the_dead_man_is_held(stick, expected):
-    assert stick_twist(stick, 0.8, 1.0) == expected

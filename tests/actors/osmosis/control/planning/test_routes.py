@@ -21,13 +21,11 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.airport.route_check import RouteCheck
-from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.route_control import BlockageWatch
 from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
 from rampart.actors.osmosis.control.planning.route_search import plan_route, without
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import Mode
-from tests.actors.osmosis.control.world import Circle, World, drive
 from tests.osmosis_system import System, in_system
 
 RING = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}
@@ -237,42 +235,6 @@ def test_no_progress_with_something_ahead_is_a_blockage_since_the_last_progress(
     standing = BlockageWatch()
     for now_s in range(30):
         assert standing.update(20.0, HERE, BESIDE, now_s) is None, "it stands on an empty runway"
-
-
-# ---- light verification -------------------------------------------------------------------------
-
-ROW = ((0.0, 0.0), (30.0, 0.0))
-
-
-def row(pass_after_s=5.0, half_width_m=2.75):
-    return LightRow(ROW, limits=RowLimits(pass_after_s=pass_after_s),
-                    edge_m=lambda _x, y: half_width_m - abs(y))
-
-
-@pytest.mark.parametrize("aside_m", [-0.4, 0.0])
-def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_behind_it(aside_m):
-    world = World(circles=[Circle(12.0, aside_m, 0.4)])
-    motion = drive(world, row(), 70.0)
-    assert motion.arrived
-    assert world.least_clearance_m >= 0.2
-    assert max(abs(y) for _, y in world.track) <= 1.45
-    behind = [abs(y) for x, y in world.track if x > 16.0]
-    assert behind
-    assert max(behind) <= 0.25, "on the row again soon"
-
-
-@pytest.mark.parametrize(("follower", "aside_m"), [
-    (lambda: LightRow(ROW), (0.0,)), (lambda: row(half_width_m=1.3), (0.0,)),
-    (row, (-2.0, -1.0, 0.0, 1.0, 2.0))],
-    ids=["as in the paper", "no room on the pavement", "both sides are blocked"])
-def test_else_it_waits_and_touches_nothing(follower, aside_m):
-    world = World(circles=[Circle(12.0, y_m, 0.4) for y_m in aside_m])
-    motion = drive(world, follower(), 30.0)
-    assert not motion.arrived
-    assert motion.linear_mps == 0.0
-    assert world.least_clearance_m >= 0.2
-    if len(aside_m) == 1:
-        assert max(abs(y) for _, y in world.track) < 0.05
 
 
 # ---- the planner as an actor --------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation, stick_twist
 from tests.actors.osmosis.driven_robot import driven
 from tests.osmosis_system import in_system, shipped_system
 from tests.virtual_time import within
@@ -75,3 +75,12 @@ async def test_a_stick_held_all_through_an_emergency_stop_drives_only_after_it_w
     await asyncio.sleep(0.1)
     robot.hold(0.75)
     assert await robot.fastest(1.0) > 0.7
+
+
+@pytest.mark.parametrize(("stick", "expected"), [
+    (m.Joystick(-0.5, 0.5, True), m.StickTwist(-0.4, 0.5)),
+    (m.Joystick(7.0, -7.0, True), m.StickTwist(0.8, -1.0)),
+    (m.Joystick(1.0, 0.0, False), None),
+    (m.Joystick(float("nan"), 0.0, True), None)])
+def test_the_stick_is_a_velocity_only_while_the_dead_man_is_held(stick, expected):
+    assert stick_twist(stick, 0.8, 1.0) == expected
