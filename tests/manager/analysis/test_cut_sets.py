@@ -66,22 +66,20 @@ def trees(draw, *, coherent: bool) -> Formula:
     return Formula(gates, frozenset(names), house, f"g{len(gates) - 1}")
 
 
-@given(trees(coherent=True))
-def test_coherent_trees_have_the_cut_sets_that_brute_force_finds(tree):
-    found = CutSets(tree)
-    listed = [frozenset(s) for s in found.sets()]
-    assert set(listed) == brute_force(tree)
-    assert len(listed) == len(set(listed)) == found.count
-    assert [len(s) for s in listed] == sorted(len(s) for s in listed)
-    for size, count in enumerate(found.sizes):
-        assert count == sum(len(s) == size for s in listed)
-
-
-@given(trees(coherent=False))
-def test_trees_with_negations_have_the_minimal_sets_that_brute_force_finds(tree):
-    found = CutSets(tree)
-    assert {frozenset(s) for s in found.sets()} == brute_force(tree)
-    assert found.count == len(brute_force(tree))
+@pytest.mark.parametrize("coherent", [True, False])
+@given(st.data(), st.integers(0, 4))
+def test_trees_have_the_minimal_sets_of_so_many_events_that_brute_force_finds(
+        coherent, data, order):
+    tree = data.draw(trees(coherent=coherent))
+    expected = brute_force(tree)
+    for most in (order, None):
+        found = CutSets(tree, max_order=most)
+        listed = [frozenset(s) for s in found.sets()]
+        assert set(listed) == {s for s in expected if most is None or len(s) <= most}
+        assert len(listed) == len(set(listed)) == found.count
+        assert [len(s) for s in listed] == sorted(len(s) for s in listed)
+        for size, count in enumerate(found.sizes):
+            assert count == sum(len(s) == size for s in listed)
 
 
 def ladder(n: int) -> Formula:
@@ -106,14 +104,6 @@ def test_more_gates_in_a_chain_than_python_recurses_through_are_no_problem():
     assert found.count == 601
     with pytest.raises(TooLargeError, match="levels deep: expected at most"):
         list(found.sets())
-
-
-@given(trees(coherent=True) | trees(coherent=False), st.integers(0, 4))
-def test_max_order_leaves_exactly_the_sets_of_so_many_events(tree, order):
-    found = CutSets(tree, max_order=order)
-    small = {one for one in brute_force(tree) if len(one) <= order}
-    assert {frozenset(one) for one in found.sets()} == small
-    assert found.count == len(small)
 
 
 def test_a_tree_of_more_variables_than_the_library_can_recurse_through_is_refused():
