@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import time
-from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -73,7 +72,7 @@ def routers(sockets):
 
 
 @asynccontextmanager
-async def client(folder: str, name: str = "") -> AsyncIterator[ZenohBus]:
+async def client(folder: str, name: str = ""):
     bus = ZenohBus(name, endpoints(folder))
     await bus.open()
     try:
@@ -208,7 +207,7 @@ def be_client(folder: str, ready) -> None:
 
 
 @asynccontextmanager
-async def hung_client(folder: str) -> AsyncIterator[int]:
+async def hung_client(folder: str):
     """Have a client that hangs; yields the id of its process."""
     ready = FORKS.Event()
     hung = FORKS.Process(target=be_client, args=(folder, ready), daemon=True)

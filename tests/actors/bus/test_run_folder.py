@@ -7,7 +7,6 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -143,7 +142,7 @@ def test_where_one_place_cannot_be_written_the_next_one_serves(tmp_path, monkeyp
 
 
 @contextmanager
-def answering(answer: bytes) -> Iterator[int]:
+def answering(answer: bytes):
     """Stand for a launcher that answers once; yields its base port."""
     port = free_base_port()
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as launcher:

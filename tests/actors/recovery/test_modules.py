@@ -1,10 +1,8 @@
 """Recovery modules that a specification alone makes: `Hold`, `Call`, `Respawn`, and its group."""
 
 import asyncio
-from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import Any
 
 import pytest
 
@@ -33,7 +31,7 @@ SHUT = {"topic": "tank/order", "message": {"shut": True, "opening": 0}}
 class Case(Boss):
     """A recovery module and its messages, with a manager that commands it."""
 
-    def __init__(self, system: VirtualSystem, kind: type, **parameters: Any) -> None:
+    def __init__(self, system: VirtualSystem, kind: type, **parameters) -> None:
         super().__init__(system)
         self.start = partial(system.start, "R", kind, **parameters)
         self.said = system.hear(ORDER)
@@ -48,7 +46,7 @@ class Case(Boss):
 
 
 @asynccontextmanager
-async def played(kind: type, **parameters: Any) -> AsyncIterator[tuple[VirtualSystem, Case]]:
+async def played(kind: type, **parameters):
     async with VirtualSystem(topics=TOPICS) as system:
         case = Case(system, kind, **parameters)
         await asyncio.sleep(0.05)
@@ -443,7 +441,7 @@ CHAIN = ["camera", "finder", "planner"]
 
 
 @asynccontextmanager
-async def group(**parameters: Any) -> AsyncIterator[tuple[System, Supervisor, Boss]]:
+async def group(**parameters):
     async with System() as system:
         for name in CHAIN:
             system.start(name, Node)

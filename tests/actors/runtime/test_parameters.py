@@ -2,7 +2,6 @@
 
 import collections
 import re
-from typing import Any
 
 import msgspec
 import pytest
@@ -42,7 +41,7 @@ def plan(file: str) -> RunPlan:
     return RunPlan(seed=5, system_file=file)
 
 
-def said(table: str, name: str, **parameters: Any) -> SystemSpec:
+def said(table: str, name: str, **parameters) -> SystemSpec:
     """The full system with other parameters of one module."""
     rows = tuple(msgspec.structs.replace(row, parameters={**row.parameters, **parameters})
                  if row.name == name else row for row in getattr(FULL_SPEC, table))

@@ -8,7 +8,6 @@ import pytest
 from msgspec.structs import replace
 
 from rampart import Arbiter, Context, verify
-from rampart.actors.ftm import messages as fm
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
@@ -136,7 +135,7 @@ def test_a_resumed_run_has_not_cleared(tmp_path, clears):
     """Its nodes have higher incarnations of the same checkpoints; its time is another one."""
     spec = full_with("FTM13", clears)
 
-    async def part(number: int, error: str = "", *, reset: bool = False) -> fm.ManagerStatus:
+    async def part(number: int, error: str = "", *, reset: bool = False):
         def manager(context: Context) -> FtmManager:
             return FtmManager(dataclasses.replace(context, checkpoints=FileCheckpoints(
                 tmp_path, "ftm_manager", "run", number * OF_A_PART + context.incarnation)))

@@ -3,7 +3,6 @@
 import asyncio
 import copy
 from functools import partial
-from typing import Any
 
 import msgspec
 import pytest
@@ -26,7 +25,7 @@ from tests.virtual_time import within
 DOCUMENT = read_document(PAPER, "paper.toml")
 
 
-def change(action: str, name: str, /, **values: Any) -> SystemSpec:
+def change(action: str, name: str, /, **values) -> SystemSpec:
     before = copy.deepcopy(DOCUMENT)
     _, spec = adapt(DOCUMENT, Change(Action(action), name, values), "paper.toml")
     assert before == DOCUMENT
@@ -98,7 +97,7 @@ def test_values_are_read_as_toml_and_words_as_text(text, value):
 class Adaptable(Managed):
     """The manager, which is asked for changes."""
 
-    def __init__(self, **plan: Any) -> None:
+    def __init__(self, **plan) -> None:
         super().__init__(document=copy.deepcopy(DOCUMENT), **plan)
         self.answers, self.systems, self.shadows = map(self.hear, (
             topics.ADAPTATION, topics.ADAPTED_SYSTEM, topics.SHADOW))
