@@ -23,14 +23,14 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.foreign import channel as channel_module
 from rampart.actors.foreign import output_log
 from rampart.actors.foreign.channel import MAX_PACKET, Channel
-from rampart.actors.foreign.descendants import descendants, is_below, kill_all
+from rampart.actors.foreign.descendants import descendants
 from rampart.actors.foreign.output_log import BURST_BYTES, OutputLog
 from rampart.actors.foreign.program import inherited_environment
 from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
-from rampart.testing import eventually, wait_until
+from rampart.testing import eventually
 from tests import ROOT
 
 FORKS = """
@@ -179,19 +179,6 @@ async def test_limits_and_signals_are_those_of_the_program_and_not_of_this_proce
     assert not [one for one in signal.valid_signals() if int(ignored, 16) >> (one - 1) & 1]
     with pytest.raises(ValueError, match=r"limits\.open_files = .* is above the hard limit"):
         Started(tmp_path, "", open_files=mine[1] + 1)
-
-
-def test_all_below_a_process_are_found_and_killed():
-    with subprocess.Popen(["sh", "-c", "sh -c 'sleep 600; true' & sleep 601; true"]) as parent:
-        try:
-            wait_until(lambda: len(descendants(parent.pid)) == 3)
-            pids = descendants(parent.pid)
-            assert all(is_below(pid, parent.pid) for pid in pids)
-            assert not is_below(parent.pid, min(pids))
-            kill_all(lambda: [pid for pid in pids if process_state(pid) not in "XZ"])
-            assert are_gone(pids)
-        finally:
-            parent.kill()
 
 
 SEND = """

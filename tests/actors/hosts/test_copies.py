@@ -51,9 +51,6 @@ class Host:
         self.disk[node] = record
         self.copies.note_kept(node, record)
 
-    def message(self) -> Checkpoints:
-        return self.copies.all()
-
     def receive(self, other: str, message: Checkpoints) -> Received:
         received = self.copies.receive(other, message)
         self.problems += received.problems
@@ -79,18 +76,18 @@ def held(node: str, record: Record, *, final: bool = False) -> KeptState:
 
 def exchange(robot: Host, ground: Host) -> None:
     """Both publish what they hold, and receive it."""
-    ground.receive("", robot.message())
-    robot.receive("ground", ground.message())
+    ground.receive("", robot.copies.all())
+    robot.receive("ground", ground.copies.all())
 
 
 def test_a_message_has_all_since_everything_was_repeated_and_what_a_full_disk_lost_comes_again(
         robot, ground):
-    ground.message()
+    ground.copies.all()
     ground.keep("camera", state(1, 1))
     ground.keep("hmi", state(1, 1))
     changes = ground.copies.changes()
     assert {kept.node for kept in changes.kept} == {"camera", "hmi"}
-    newest = ground.message()
+    newest = ground.copies.all()
     assert ground.copies.changes().kept == ()
     assert robot.copies.receive("ground", newest).records  # and the disk is full
     assert robot.receive("ground", newest).records
@@ -101,7 +98,7 @@ def test_states_from_a_host_that_does_not_share_the_node_are_refused_and_reporte
     robot.receive("moon", Checkpoints("r", (held("camera", state(1, 7), final=True),)))
     robot.receive("ground", Checkpoints("r", (held("pilot", state(1, 7)),)))
     ground.keep("camera", state(1, 7))
-    robot.receive("ground", msgspec.structs.replace(ground.message(), run="last week's"))
+    robot.receive("ground", msgspec.structs.replace(ground.copies.all(), run="last week's"))
     assert robot.disk == {}
     assert [who for who, _ in robot.problems] == ["camera", "pilot", "ground"]
     assert not robot.copies.is_caught_up({"camera": 0})  # nor is it taken for the last one
@@ -113,15 +110,15 @@ def test_states_from_a_host_that_does_not_share_the_node_are_refused_and_reporte
 def test_a_state_of_an_incarnation_that_is_not_known_to_be_issued_is_not_taken_yet(robot, ground):
     """Else one message with the highest number there is would shut out all real ones."""
     ground.keep("camera", state(2**53, 1))
-    robot.receive("ground", ground.message())
+    robot.receive("ground", ground.copies.all())
     assert robot.disk == {}
     ground = Host("ground", camera=2)
     ground.keep("camera", state(2, 1))
     robot.issued["camera"] = 1
-    robot.receive("ground", ground.message())
+    robot.receive("ground", ground.copies.all())
     assert robot.disk == {}
     robot.issued["camera"] = 2  # its table has arrived
-    robot.receive("ground", ground.message())
+    robot.receive("ground", ground.copies.all())
     assert robot.disk == {"camera": state(2, 1)}
 
 
@@ -129,7 +126,7 @@ def test_the_largest_states_of_all_nodes_come_one_by_one_and_fit_into_a_message(
     for node in ("camera", "hmi"):
         ground.keep(node, state(1, 1, b"x" * LARGEST_STATE_BYTES))
     for turn in range(2):
-        message = ground.message()
+        message = ground.copies.all()
         assert len(encode(Header("supervisor_ground", 1, 1, 0.0), message)) < MAX_PAYLOAD_BYTES
         robot.receive("ground", message)
         assert len(robot.disk) == turn + 1
@@ -152,7 +149,7 @@ def taken_over(robot: Host, ground: Host) -> None:
 def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot, ground):
     robot.issued["camera"] = 1
     exchange(robot, ground)
-    before = robot.message()
+    before = robot.copies.all()
     robot.issued["camera"] = 10 * EPOCH
     taken_over(robot, ground)
     issued = {"camera": EPOCH + 1}
@@ -173,7 +170,7 @@ def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot,
     assert not ground.copies.is_caught_up(issued)  # its process is being ended
     robot.keep("camera", state(EPOCH + 1, 12))
     robot.copies.settle("camera")
-    last = robot.message()
+    last = robot.copies.all()
     ground.copies.receive("", last)
     assert not ground.copies.is_caught_up(issued)  # the last state is not on the disk
     ground.receive("", last)
@@ -204,7 +201,7 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
         elif what.endswith("publishes"):
             sender, receiver = (robot, ground) if what == "robot publishes" else (ground, robot)
             under_way.append(
-                (receiver, sender.name, sender.copies.changes() if which else sender.message()))
+                (receiver, sender.name, sender.copies.changes() if which else sender.copies.all()))
         elif what in {"receive", "again"} and under_way:
             receiver, name, message = under_way[which % len(under_way)]
             receiver.receive(name, message)

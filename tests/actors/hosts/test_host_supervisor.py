@@ -81,7 +81,6 @@ class Host(Machine):
         self.folder = run_folder.make(20000, 1)
         self.disk: dict[str, Record] = {}
         self.loaded: dict[tuple[str, int], Record | None] = {}
-        self.ends_after_s = 0.005
         self.files: Files | None = None
         self._plan = RunPlan(
             "r", 20000, system_file=str(world.file), host=name, folder=self.folder,
@@ -111,11 +110,6 @@ class Host(Machine):
         for name in names:
             self.loaded[name, incarnation] = self.disk.get(name)
         return super().add(names, incarnation, bound=bound)
-
-    def kill(self, process):
-        if not process.killed:
-            process.killed = True
-            asyncio.get_running_loop().call_later(self.ends_after_s, self._exited, process)
 
     def runs(self, name: str) -> int:
         return max((p.incarnation for p in self.of(name)), default=0)

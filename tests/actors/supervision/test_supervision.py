@@ -209,10 +209,13 @@ async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permit
     assert set().union(*nice.values()) == {own}
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
-async def test_the_supervisor_comes_back_and_adopts_the_living(witness, port, number):
-    async with witness.comes_back("supervisor", alone=True):
-        os.kill(process(port, "supervisor"), number)
+@pytest.mark.parametrize(("guard", "number"), [
+    ("supervisor", signal.SIGKILL), ("supervisor", signal.SIGSTOP), ("supervisor", signal.SIGTERM),
+    ("router_a", signal.SIGSTOP)])
+async def test_a_supervisor_or_router_comes_back_and_costs_no_other_its_process(
+        witness, port, guard, number):
+    async with witness.comes_back(guard, alone=True):
+        os.kill(process(port, guard), number)
 
 
 async def test_a_supervisor_that_stood_still_for_a_while_blames_nobody_for_it(witness, port):
@@ -234,11 +237,6 @@ async def test_with_the_supervisor_and_both_routers_gone_all_three_come_back(wit
         witness.state(name)[0] == "running" and witness.pid(name) != old[name]
         for name in victims), 15)
     await eventually(witness.all_run, 15)
-
-
-async def test_a_stopped_router_is_replaced_and_costs_no_node_its_process(witness):
-    async with witness.comes_back("router_a", alone=True):
-        os.kill(witness.pid("router_a"), signal.SIGSTOP)
 
 
 async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(witness, port, capsys):

@@ -20,14 +20,8 @@ import pytest
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
 from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import (
-    AdaptedSystem,
-    ManagerStatus,
-    NodeState,
-    ProgramEnd,
-    RespawnRequest,
-)
 from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.runtime.actor import Actor
@@ -58,8 +52,6 @@ from tests.whole.missions import write_mission
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
 USUAL = Supervision()
-EXIT_S = 0.005
-"""From a SIGKILL to the moment when the last thread has let go of the port."""
 
 
 @dataclass
@@ -114,6 +106,7 @@ class Machine:
         self.starves_from_s: dict[str, float] = {}
         self.turning = False
         self.questions = 0
+        self.ends_after_s = 0.005  # from a SIGKILL until the last thread has let go of the port
 
     def usage(self, process: Process) -> Usage:
         now_s = asyncio.get_running_loop().time()
@@ -136,7 +129,7 @@ class Machine:
     def kill(self, process: Process) -> None:
         if not process.killed:
             process.killed = True
-            asyncio.get_running_loop().call_later(EXIT_S, self._exited, process)
+            asyncio.get_running_loop().call_later(self.ends_after_s, self._exited, process)
 
     def _exited(self, process: Process) -> None:
         process.gone = True
@@ -167,7 +160,7 @@ class Machine:
             raise ProcessLookupError(pid)
         return Handle(self, process, ended)
 
-    def adapt(self, adapted: AdaptedSystem) -> None:
+    def adapt(self, adapted: m.AdaptedSystem) -> None:
         pass
 
 
@@ -227,7 +220,7 @@ class World:
         return process.shown.value, process.incarnation, process.pid
 
     def all_run(self) -> bool:
-        return all(p.shown is NodeState.RUNNING for p in self.supervisor._processes.values())
+        return all(p.shown is m.NodeState.RUNNING for p in self.supervisor._processes.values())
 
     def kill(self, name: str) -> Process:
         (process,) = self.machine.of(name)
@@ -235,7 +228,7 @@ class World:
         return process
 
     def respawn(self, name: str, failed: int) -> None:
-        self.say(topics.RESPAWN, RespawnRequest(1, name, failed, "RM7"))
+        self.say(topics.RESPAWN, m.RespawnRequest(1, name, failed, "RM7"))
 
 
 @asynccontextmanager
@@ -331,7 +324,7 @@ async def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_proces
 
 
 def status(world: World, life: int, stamp_s: float | None = None) -> None:
-    world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
+    world.say(topics.MANAGER_STATUS, m.ManagerStatus((), (), (), (), "safety-first", 0),
               "ftm_manager", incarnation=life, stamp_s=stamp_s)
 
 
@@ -414,7 +407,7 @@ async def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(w
     world.machine.fork_error = "none"
     world.kill("DM2")
     await asyncio.sleep(0.02)
-    world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+    world.say(topics.ADAPTED_SYSTEM, m.AdaptedSystem(
         1, "retune DM2", "tester", msgspec.json.encode(document).decode()))
     await asyncio.sleep(outage_s)
     world.machine.fork_error = None
@@ -476,7 +469,7 @@ class Node:
     def end_program(self) -> None:
         """Report the end of its program."""
         self.world.silent.add(self.process.pid)
-        self.world.say(topics.PROGRAM_END, ProgramEnd(self.process.pid, REASON),
+        self.world.say(topics.PROGRAM_END, m.ProgramEnd(self.process.pid, REASON),
                        self.name, incarnation=self.process.incarnation)
 
     def _see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
@@ -561,7 +554,7 @@ async def test_a_new_supervisor_takes_the_end_from_its_repetition(world):
 async def test_the_end_of_another_process_or_from_a_stranger_is_nothing(world):
     node = Node(world, OWN)
     for pid, source in ((999_999, OWN), (node.process.pid, "tester")):
-        world.say(topics.PROGRAM_END, ProgramEnd(pid, REASON), source)
+        world.say(topics.PROGRAM_END, m.ProgramEnd(pid, REASON), source)
         await asyncio.sleep(0.1)
     assert world.row(OWN) == ("running", 1, node.process.pid)
     assert node.starts == []
@@ -640,16 +633,15 @@ async def test_a_process_that_fails_at_its_start_is_given_up_and_tried_again(wor
     await eventually(lambda: world.row(name)[0] == "running", 0.2)
 
 
-SHORT = Supervision()
 SLOW = Supervision(intensity=3, period_s=60)
 """Three restarts within a minute are too many; a process is well after ten minutes."""
 
 
 @pytest.mark.parametrize(("limits", "works", "present_s", "failing"), [
-    (SHORT, [0.1] * 3, 0.0, True), (SHORT, [0.1] * 3, 1.1, False), (SHORT, [0.1] * 2, 0.0, False),
-    (SHORT, [1.3] * 20, 1.3, True), (SHORT, [1.3] * 20, 10.1, False),
-    (SHORT, [2.9] * 9, 0.1, False), (SHORT, [1.3] * 20 + [12.0] + [1.3] * 9, 0.0, False),
-    (SHORT, [300.0] + [9.9] * 20, 0.0, True),
+    (USUAL, [0.1] * 3, 0.0, True), (USUAL, [0.1] * 3, 1.1, False), (USUAL, [0.1] * 2, 0.0, False),
+    (USUAL, [1.3] * 20, 1.3, True), (USUAL, [1.3] * 20, 10.1, False),
+    (USUAL, [2.9] * 9, 0.1, False), (USUAL, [1.3] * 20 + [12.0] + [1.3] * 9, 0.0, False),
+    (USUAL, [300.0] + [9.9] * 20, 0.0, True),
     (SLOW, [70.0] * 3, 0.0, True), (SLOW, [70.0] * 2, 0.0, False), (SLOW, [70.0] * 3, 599.0, True),
     (SLOW, [70.0] * 3, 600.0, False), (SLOW, [70.0, 70.0, 601.0, 70.0], 0.0, False),
     (SLOW, [900.0] * 40, 0.0, False)])  # killed four times an hour
@@ -709,7 +701,7 @@ async def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(wo
     await eventually(lambda: world.row("DM2")[0] == "given up")
     document, _ = adapt(load_document(PLAN), Change(
         Action.RETUNE, "DM2", {"timeout_s": 0.995}), PLAN.system_file)
-    world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+    world.say(topics.ADAPTED_SYSTEM, m.AdaptedSystem(
         2, "retune DM2", "somebody", msgspec.json.encode(document).decode()))
     await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
 
@@ -738,7 +730,7 @@ def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
     unit = Unit("a", (NodeSpec("a", Kind.CONTROL, "m:A"), NodeSpec("b", Kind.CONTROL, "m:B")))
     made = SupervisedProcess(unit, RestartPolicy(Supervision(**limits)), Patience(0.2), state)
     if state is not State.RESTARTING:
-        made.shown = NodeState(state.value)
+        made.shown = m.NodeState(state.value)
     return made
 
 
@@ -813,7 +805,7 @@ def test_a_change_to_processes_hosts_and_modules_that_do_not_run_is_refused(
     layout, document = Layout(plan, load_system(plan)), load_document(plan)
 
     def change() -> str:
-        adapted = AdaptedSystem(1, "a change", "me", json.dumps(document))
+        adapted = m.AdaptedSystem(1, "a change", "me", json.dumps(document))
         return adapted_system(layout, RunContext(), adapted)[0].spec.strategy
 
     document["strategy"] = "guarded-repair"
