@@ -35,7 +35,7 @@ from rampart.sim.osmosis.trial import paper_tables as paper
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.systems import SHIPPED
 from rampart.testing import wait_until
-from tests import CELL, ROOT
+from tests import CELL, ROOT, TANK
 from tests.porter_actors import write_porter_system
 
 PAPER = systems.load("paper")
@@ -442,17 +442,9 @@ def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_co
 # -- A stored result stands for a run only while all that went into the run is the same --
 
 
-TIMES = ("heartbeat", "command", "localization", "scan", "dead_man", "manager",
-         "detection_silence")
-SPEC = 'name = "tank"\ntitle = "A tank"\n[timing]\n' + "".join(
-    f"{name}_timeout_s = 1.0\n" for name in TIMES) + """
-[layers]
-ftm = false
+SPEC = TANK + """
 [end]
 after_s = 3.0
-[orders.safer]
-[[event]]
-name = "overflow"
 [[node]]
 name = "pump"
 actor = "tank_parts.pump:Pump"
@@ -460,23 +452,12 @@ kind = "control"
 parameters = { curve = "curve.csv" }
 """
 PUMP = """
-from rampart import Actor, Message, Qos, Topic, every
+from rampart import Actor
 from .limits import MOST_M
-
-class Level(Message):
-    level_m: float
-
-LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10, "", "Level.")
 
 class Pump(Actor):
     class Parameters(Actor.Parameters, frozen=True):
         curve: str = ""
-
-    outputs = (LEVEL,)
-
-    @every(0.1)
-    def say(self) -> None:
-        self.publish(LEVEL, Level(MOST_M))
 """
 FILES = {"tank.toml": SPEC, "curve.csv": "1,2\n", "tank_parts/pump.py": PUMP,
          "tank_parts/limits.py": "import json\nMOST_M = 2.0\n", "tank_parts/__init__.py": "",

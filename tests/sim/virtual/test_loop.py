@@ -110,12 +110,9 @@ def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
 
 def test_files_are_served_while_time_stands_still():
     async def scenario():
-        served = asyncio.Event()
-
         async def serve(_reader, writer):
             writer.write(b"hello")
             writer.close()
-            served.set()
 
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
