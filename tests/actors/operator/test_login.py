@@ -23,18 +23,7 @@ from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import Browser, browser
 from tests.actors.operator.test_operating import RELEASED, Hand
-from tests.actors.operator.world import (
-    LIVE,
-    SPEC,
-    TOKEN,
-    ask,
-    bearer,
-    hear,
-    open_page,
-    repeated,
-    served,
-    visited,
-)
+from tests.actors.operator.world import LIVE, TOKEN, ask, hear, open_page, repeated, served, visited
 from tests.actors.web.pems import pair
 from tests.osmosis_system import shipped_system
 from tests.other_user import as_nobody, needs_root
@@ -74,7 +63,8 @@ async def test_who_logs_in_gets_a_cookie_drives_and_logs_out_and_all_others_see_
                 refused = await client.get(path)
                 assert refused.status_code == 401
                 assert "Authorization: Bearer TOKEN" in refused.text
-            assert (await client.get("/other", headers=bearer(TOKEN))).status_code == 404
+            by_header = {"Authorization": f"Bearer {TOKEN}"}
+            assert (await client.get("/other", headers=by_header)).status_code == 404
             answer = await log_in(client, TOKEN)
             assert (answer.status_code, answer.json()) == (
                 200, {"name": "operator", "role": "inject"})
@@ -304,9 +294,9 @@ def encrypted(world, tmp_path):
     @asynccontextmanager
     async def shown(**fields):
         async with world.hmi(
-                hmi_host="0.0.0.0", hmi_cert=str(certificate), hmi_key=str(key), system=SPEC,
-                launcher_pid=1, faults=OsmosisFaults().offered(), **fields) as hmi, repeated(
-                world.others.busy, 0.05):
+                hmi_host="0.0.0.0", hmi_cert=str(certificate), hmi_key=str(key),
+                system=shipped_system(), launcher_pid=1, faults=OsmosisFaults().offered(),
+                **fields) as hmi, repeated(world.others.busy, 0.05):
             async with browser() as tab:
                 await tab.call("Security.setIgnoreCertificateErrors", ignore=True)
                 await tab.show(f"https://{await served(hmi)}/")

@@ -22,17 +22,7 @@ from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.supervision.kill_node import UnknownNodeError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.testing import eventually
-from tests.actors.operator.world import (
-    AIRPORT,
-    RATE,
-    ask,
-    hear,
-    open_page,
-    repeated,
-    served,
-    show,
-    visited,
-)
+from tests.actors.operator.world import ask, hear, open_page, repeated, served, show, visited
 from tests.osmosis_system import shipped_system
 
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -334,9 +324,9 @@ async def test_the_mission_is_asked_for_when_the_last_node_runs_until_it_is_take
         for _ in range(20):
             await asyncio.sleep(0)
 
-    async with world.hmi(mission=AIRPORT.mission("AB")):
+    async with world.hmi(mission=world.airport.mission("AB")):
         await report(fm.NodeState.STARTING)
-        await asyncio.sleep(1.0 / RATE)  # two repetitions
+        await asyncio.sleep(1.0 / world.clock.rate)  # two repetitions
         assert not world.others.requests
         await report(fm.NodeState.RUNNING)
         assert world.others.requests
@@ -348,7 +338,7 @@ async def test_the_mission_is_asked_for_when_the_last_node_runs_until_it_is_take
         count = len(world.others.requests)
         world.others.publish(topics.MISSION_STATUS, m.MissionStatus(
             "", "", m.MissionPhase.IDLE, 0, (), (), (), ""))
-        await asyncio.sleep(2.0 / RATE)
+        await asyncio.sleep(2.0 / world.clock.rate)
         assert len(world.others.requests) == count
 
 

@@ -98,6 +98,8 @@ class Others(Actor):
 class World:
     """A hub with `Others` on it; HMIs join and leave."""
 
+    airport = AIRPORT
+
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
         self.hub = Hub()

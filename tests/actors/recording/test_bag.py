@@ -3,6 +3,7 @@
 import csv
 import inspect
 import json
+import math
 import re
 import struct
 import sys
@@ -28,16 +29,7 @@ from rampart.actors.recording.recorder import VirtualRecording
 from rampart.actors.recording.run_documents import collect, restore
 from rampart.cli.main import main
 from rampart.systems import SHIPPED
-from tests.actors.recording.samples import (
-    NAN,
-    PLAN,
-    documents,
-    foreign,
-    pose,
-    sample,
-    small_disk,
-    write,
-)
+from tests.actors.recording.samples import PLAN, documents, foreign, pose, sample, small_disk, write
 from tests.porter_actors import LOAD, Load, write_porter_system
 
 form_of = Forms(topics.ALL).of
@@ -160,8 +152,8 @@ def test_odometry_and_pose_make_a_chain_of_frames_from_map_to_base_link():
 
 def test_what_is_no_number_is_not_shown():
     header = Header("x", 1, 1, 0.0)
-    assert OsmosisViews().of(topics.POSE, "", header, m.Pose(NAN, 0.0, 0.0), 0) == []
-    sweep = m.LaserScan(-1.0, 0.5, 30.0, struct.pack("<5f", 1.0, 30.0, 2.5, float("inf"), NAN))
+    assert OsmosisViews().of(topics.POSE, "", header, m.Pose(math.nan, 0.0, 0.0), 0) == []
+    sweep = m.LaserScan(-1.0, 0.5, 30.0, struct.pack("<5f", 1.0, 30.0, 2.5, math.inf, math.nan))
     [(channel, scan)] = OsmosisViews().of(topics.SCAN, "", header, sweep, 0)
     assert channel == "view/scan"
     assert (scan.start_angle, scan.end_angle, scan.ranges) == (-1.0, 1.0, [1.0, 0.0, 2.5, 0.0, 0.0])

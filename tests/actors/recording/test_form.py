@@ -19,13 +19,8 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.message_form import (
-    Forms,
-    MessageForm,
-    Recorded,
-    header_of,
-    plain_schema,
-)
+from rampart.actors.recording import message_form
+from rampart.actors.recording.message_form import Forms, MessageForm, Recorded, plain_schema
 
 form_of = Forms(topics.ALL).of
 
@@ -105,7 +100,7 @@ def test_garbage_in_the_form_of_an_envelope_with_a_text_that_is_none_is_garbage_
         assert "error" in json.loads(text)
         assert form.payload(text) == payload
     nameless = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\xc0"
-    assert header_of(nameless) is None
+    assert message_form.header_of(nameless) is None
 
 
 def test_a_message_is_legible_and_only_one_that_json_cannot_hold_has_its_payload_beside_it():

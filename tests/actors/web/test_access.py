@@ -12,26 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from itsdangerous import TimestampSigner
 
-from rampart.actors.web import audit
+from rampart.actors.web import audit, visitors
 from rampart.actors.web.access import Access, AccessError, check_token, page_url
 from rampart.actors.web.audit import STRANGERS_S, AuditLog, read_audit
 from rampart.actors.web.door import LASTS_S, Gate
-from rampart.actors.web.visitors import (
-    MOST,
-    SECRET_BYTES,
-    Register,
-    Role,
-    SecretError,
-    Visitor,
-    VisitorError,
-    digest,
-    issue,
-    lists_visitors,
-    parse,
-    read_secret,
-    read_visitors,
-    revoke,
-)
+from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, issue
 from rampart.cli.main import main
 from tests.other_user import NOBODY, needs_root
 
@@ -193,7 +178,8 @@ LISTED = f"anna drive {'a' * 64}"
 
 
 def test_a_file_is_read_with_comments_and_blank_lines():
-    assert parse(["# who", "", f"  {LISTED}  # the first", f"b.o-b@x look {'b' * 64}"]) == {
+    lines = ["# who", "", f"  {LISTED}  # the first", f"b.o-b@x look {'b' * 64}"]
+    assert visitors.parse(lines) == {
         "anna": Visitor("anna", Role.DRIVE, "a" * 64),
         "b.o-b@x": Visitor("b.o-b@x", Role.LOOK, "b" * 64)}
 
@@ -207,11 +193,11 @@ def test_a_file_is_read_with_comments_and_blank_lines():
     ([LISTED, f"bob look {'a' * 64}"], "line 2: 'bob': another visitor has the same token"),
     (["an|na drive " + "a" * 64], "line 1: name 'an|na': expected up to 40"),
     (["anna drive " + "A" * 64], "line 1: anna: expected the SHA-256 of a token"),
-    ([f"v{i} look {i:064x}" for i in range(MOST + 1)],
-     f"{MOST + 1} names; expected at most {MOST}")])
+    ([f"v{i} look {i:064x}" for i in range(visitors.MOST + 1)],
+     f"{visitors.MOST + 1} names; expected at most {visitors.MOST}")])
 def test_what_is_no_list_of_visitors_is_one_line(lines, why):
     with pytest.raises(VisitorError) as error:
-        parse(lines)
+        visitors.parse(lines)
     assert str(error.value).startswith(why)
     assert "\n" not in str(error.value)
 
@@ -220,14 +206,14 @@ def test_a_token_is_issued_once_kept_as_a_digest_and_revoked(tmp_path):
     file = tmp_path / "page.tokens"
     anna, bob = issue(file, "anna", Role.DRIVE), issue(file, "bob", Role.LOOK)
     assert file.stat().st_mode & 0o777 == 0o600
-    assert read_visitors(file) == {"anna": Visitor("anna", Role.DRIVE, digest(anna)),
+    assert visitors.read_visitors(file) == {"anna": Visitor("anna", Role.DRIVE, digest(anna)),
                                    "bob": Visitor("bob", Role.LOOK, digest(bob))}
     with pytest.raises(VisitorError, match="anna has a token already; revoke it first"):
         issue(file, "anna", Role.LOOK)
-    revoke(file, "anna")
-    assert list(read_visitors(file)) == ["bob"]
+    visitors.revoke(file, "anna")
+    assert list(visitors.read_visitors(file)) == ["bob"]
     with pytest.raises(VisitorError, match="no visitor 'anna'; known: bob"):
-        revoke(file, "anna")
+        visitors.revoke(file, "anna")
 
 
 def test_a_file_of_one_word_is_a_bare_token_and_all_else_a_list(tmp_path):
@@ -236,7 +222,7 @@ def test_a_file_of_one_word_is_a_bare_token_and_all_else_a_list(tmp_path):
     for text, is_list in (("secret-of-the-hangar-7\n", False), (f"{LISTED}\n", True), ("", True),
                           ("# nobody yet\n", True), (f"# all\n{LISTED}\n", True)):
         file.write_text(text)
-        assert lists_visitors(file) is is_list
+        assert visitors.lists_visitors(file) is is_list
 
 
 def test_a_file_that_changes_is_read_anew_and_one_that_breaks_lets_nobody_in(tmp_path):
@@ -284,7 +270,7 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
     assert json.loads(tokens("show", "--json")) == [{"name": "anna", "role": "drive"}]
     assert tokens("show").split() == ["name", "role", "anna", "drive"]
     assert tokens("revoke", "anna") == "revoked the token of anna\n"
-    assert read_visitors(file) == {}
+    assert visitors.read_visitors(file) == {}
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -316,17 +302,17 @@ def file(tmp_path) -> Path:
 
 
 def not_taken(file: Path) -> str:
-    with pytest.raises(SecretError) as error:
-        read_secret(file)
+    with pytest.raises(visitors.SecretError) as error:
+        visitors.read_secret(file)
     assert TOKEN not in str(error.value)
     return str(error.value)
 
 
 def test_a_file_that_only_its_owner_can_read_is_taken(file, tmp_path):
-    assert read_secret(file) == TOKEN
+    assert visitors.read_secret(file) == TOKEN
     link = tmp_path / "link"
     link.symlink_to(file)
-    assert read_secret(link) == TOKEN
+    assert visitors.read_secret(link) == TOKEN
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o602, 0o601])
@@ -342,8 +328,8 @@ def test_a_file_of_somebody_else_is_refused(file):
 
 
 @pytest.mark.parametrize("content", [
-    b"", b"\n \n", f"{TOKEN}\n{TOKEN}".encode(), b"x" * (SECRET_BYTES + 1), b"\xff\xfe" * 10,
-    "ключ-от-ангара-семь".encode()])
+    b"", b"\n \n", f"{TOKEN}\n{TOKEN}".encode(), b"x" * (visitors.SECRET_BYTES + 1),
+    b"\xff\xfe" * 10, "ключ-от-ангара-семь".encode()])
 def test_what_is_not_one_plain_line_is_refused(file, content):
     file.write_bytes(content)
     assert not_taken(file).startswith("expected one line")

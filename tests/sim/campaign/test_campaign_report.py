@@ -12,14 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from rampart.sim.campaign import report
 from rampart.sim.campaign.job import DecisionTaken, Job
-from rampart.sim.campaign.report import (
-    Campaign,
-    headline,
-    render,
-    worth_showing,
-    write_campaign_report,
-)
+from rampart.sim.campaign.report import Campaign, headline, render, worth_showing
 from rampart.sim.campaign.statistics import percent
 from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
@@ -90,12 +85,12 @@ def test_the_page_needs_nothing_but_itself():
 
 def test_the_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     made = run()
-    page = write_campaign_report(tmp_path / "new", ABOUT, [made])
+    page = report.write_campaign_report(tmp_path / "new", ABOUT, [made])
     before = render(tmp_path / "new", ABOUT, [made])
     assert page.read_text(encoding="utf-8") == before
     monkeypatch.delattr(Path, "replace")  # of the new page by the old one
     with pytest.raises(AttributeError):
-        write_campaign_report(tmp_path / "new", ABOUT, [])
+        report.write_campaign_report(tmp_path / "new", ABOUT, [])
     assert [file.read_text(encoding="utf-8") for file in page.parent.iterdir()] == [before]
 
 

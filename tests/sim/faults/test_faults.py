@@ -32,20 +32,12 @@ from rampart.cli import systems
 from rampart.cli.look.topic_verbs import resolve
 from rampart.manager.spec.specification import SpecificationError, parse_specification
 from rampart.sim.campaign.plan import fault_groups
+from rampart.sim.faults import topic_faults
 from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import Injector, can_be_hit
 from rampart.sim.faults.scenario import OnProcess, PlannedFault, ScenarioError, parse_fault
 from rampart.sim.faults.scenario import action_of as action_in
-from rampart.sim.faults.topic_faults import (
-    Disturbance,
-    Fault,
-    Sizes,
-    UnknownFaultError,
-    modes_of,
-    plausible_offsets,
-    systematic_faults,
-)
-from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
+from rampart.sim.faults.topic_faults import Disturbance, Fault, UnknownFaultError
 from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, OsmosisFaults, SuddenObstacle
 from rampart.testing import VirtualSystem, run
 from tests import TANK
@@ -56,7 +48,7 @@ from tests.two_hosts import two_hosts
 
 KEYS = published_keys(shipped_system())
 CATALOGUE = OsmosisFaults.named
-SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS, topics.ALL)}
+SYSTEMATIC = {fault.name: fault for fault in topic_faults.systematic_faults(KEYS, topics.ALL)}
 
 
 def find_fault(name: str, seed: int = 0, known: tuple[Topic[Any], ...] = topics.ALL) -> Fault:
@@ -64,7 +56,7 @@ def find_fault(name: str, seed: int = 0, known: tuple[Topic[Any], ...] = topics.
 
 
 def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
-    return topic_fault_of(mode, key, seed, topics.ALL, OsmosisFaults.sizes)
+    return topic_faults.topic_fault(mode, key, seed, topics.ALL, OsmosisFaults.sizes)
 
 
 def sample(kind: Any, n: int) -> Any:
@@ -237,13 +229,13 @@ def test_a_varied_fault_differs_in_what_was_said_and_each_disturbance_has_a_seed
 
 def test_a_topic_of_the_robot_s_own_fails_like_any_other_unless_its_numbers_have_no_names():
     known = (*topics.ALL, LOAD, AXLE)
-    assert modes_of("porter/load", known) == (
+    assert topic_faults.modes_of("porter/load", known) == (
         *MODES, "zero", "negative", "huge", "infinite", "nan")
     assert find_fault("drop:porter/axle/front", known=known).disturbances[0].topic == (
         "porter/axle/front")
     (disturbance,) = find_fault("corrupt:porter/load", 3, known).disturbances
     assert set(disturbance.add_fields) == {"mass_kg"}
-    assert set(MODES) - set(modes_of("porter/axle/front", known)) == {"corrupt"}
+    assert set(MODES) - set(topic_faults.modes_of("porter/axle/front", known)) == {"corrupt"}
     with pytest.raises(UnknownFaultError, match="Axle is array_like"):
         find_fault("corrupt:porter/axle/front", known=known)
 
@@ -273,7 +265,7 @@ GROWS = {"age_s", "load", "turns"}
 
 
 def test_how_wrong_a_number_is_follows_from_its_range_or_its_unit():
-    drawn = [plausible_offsets(Joint, Random(seed)) for seed in range(60)]
+    drawn = [topic_faults.plausible_offsets(Joint, Random(seed)) for seed in range(60)]
     for field, (least, most) in EXPECTED.items():
         found = [offsets[field] for offsets in drawn]
         assert all(least <= abs(offset) <= most for offset in found), field
@@ -282,9 +274,9 @@ def test_how_wrong_a_number_is_follows_from_its_range_or_its_unit():
 
 
 def test_a_robot_that_knows_better_says_so():
-    sizes = Sizes((("_v", 100.0, 200.0), ("torque", 1.0, 2.0)), ("_v",))
+    sizes = topic_faults.Sizes((("_v", 100.0, 200.0), ("torque", 1.0, 2.0)), ("_v",))
     for seed in range(20):
-        offsets = plausible_offsets(Joint, Random(seed), sizes)
+        offsets = topic_faults.plausible_offsets(Joint, Random(seed), sizes)
         assert 100 <= offsets["supply_v"] <= 200
         assert 1 <= abs(offsets["torque"]) <= 2
         assert 0.05 <= abs(offsets["valve"]) <= 0.3

@@ -13,15 +13,6 @@ import pytest
 
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.runs import resumption
-from rampart.sim.runs.resumption import (
-    MANIFEST,
-    Manifest,
-    ResumptionError,
-    RunFiles,
-    differences,
-    find,
-    manifest_of,
-)
 
 
 @pytest.fixture
@@ -31,13 +22,14 @@ def system(tmp_path) -> Path:
     return file
 
 
-def begun(reports: Path, name: str, system: Path, **changes) -> RunFiles:
+def begun(reports: Path, name: str, system: Path, **changes) -> resumption.RunFiles:
     """Keep what a run keeps when it starts, and let go of it as if it had been killed."""
     directory = reports / name
     directory.mkdir(parents=True)
-    files = RunFiles(directory)
+    files = resumption.RunFiles(directory)
     plan = RunPlan(run_id=f"id-{name}", system_file=str(system), options={"mission": "AB"})
-    files.save(msgspec.structs.replace(manifest_of(plan, ["--rate", "2"], []), **changes))
+    kept = resumption.manifest_of(plan, ["--rate", "2"], [])
+    files.save(msgspec.structs.replace(kept, **changes))
     return files
 
 
@@ -46,15 +38,15 @@ def test_a_run_is_found_by_directory_name_and_id_or_as_the_newest_that_did_not_e
         tmp_path, system, monkeypatch, which):
     monkeypatch.chdir(tmp_path)
     for number, (name, ended) in enumerate((("a", ""), ("b", ""), ("c", "success, safe"))):
-        file = begun(tmp_path / "reports", name, system, ended=ended).directory / MANIFEST
-        os.utime(file, (1000 + number, 1000 + number))
-    files, manifest = find(Path("reports"), which)
+        files = begun(tmp_path / "reports", name, system, ended=ended)
+        os.utime(files.directory / resumption.MANIFEST, (1000 + number, 1000 + number))
+    files, manifest = resumption.find(Path("reports"), which)
     assert (manifest.run_id, manifest.arguments) == ("id-b", ("--rate", "2"))
     files.unlock()
 
 
 def damaged(text: str):
-    return lambda files: (files.directory / MANIFEST).write_text(text)
+    return lambda files: (files.directory / resumption.MANIFEST).write_text(text)
 
 
 def kept(**changes):
@@ -62,15 +54,15 @@ def kept(**changes):
 
 
 @pytest.mark.parametrize(("change", "which", "why"), [
-    (lambda files: (files.directory / MANIFEST).unlink(), "a", MANIFEST),
-    (damaged("{"), "", MANIFEST), (damaged('{"format": 1, "run_id": 7}'), "a", "run_id"),
+    (lambda files: (files.directory / resumption.MANIFEST).unlink(), "a", resumption.MANIFEST),
+    (damaged("{"), "", resumption.MANIFEST), (damaged('{"format": 1, "run_id": 7}'), "a", "run_id"),
     (kept(format=99), "a", "99"), (kept(ended="fail, safe"), "a", "has ended (fail, safe)"),
     (kept(ended="fail, safe"), "", "no run that did not end"),
     (lambda _files: None, "b", "no such run")])
 def test_a_run_that_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change, which, why):
     change(begun(tmp_path / "reports", "a", system))
-    with pytest.raises(ResumptionError) as refused:
-        find(tmp_path / "reports", which)
+    with pytest.raises(resumption.ResumptionError) as refused:
+        resumption.find(tmp_path / "reports", which)
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -84,35 +76,35 @@ def test_a_run_that_lives_is_not_resumed_and_one_that_is_just_ending_is_waited_f
                              pass_fds=[files._lock])
     files.unlock()
     monkeypatch.setattr(resumption, "_PATIENCE_S", 0.2)
-    with pytest.raises(ResumptionError, match="still lives"):
-        find(tmp_path / "reports", "a")
+    with pytest.raises(resumption.ResumptionError, match="still lives"):
+        resumption.find(tmp_path / "reports", "a")
     child.kill()
     child.wait()
     assert files.lock()
     monkeypatch.setattr(time, "sleep", lambda _s: files.unlock())
-    found, _ = find(tmp_path / "reports", "a")
+    found, _ = resumption.find(tmp_path / "reports", "a")
     found.unlock()
 
 
-def manifest(system: Path, **changes) -> Manifest:
+def manifest(system: Path, **changes) -> resumption.Manifest:
     plan = RunPlan(run_id="r", system_file=str(system), options={"mission": "AB"})
-    return manifest_of(msgspec.structs.replace(plan, **changes), [], [])
+    return resumption.manifest_of(msgspec.structs.replace(plan, **changes), [], [])
 
 
 def test_another_system_seed_or_mission_is_named_and_another_rate_is_none_of_these(system):
     before = manifest(system)
-    assert differences(before, manifest(system, rate=4.0, run_id="s")) == ""
-    assert "seed is 2, expected 1" in differences(before, manifest(system, seed=2))
-    assert "mission is 'A', expected 'AB'" in differences(
+    assert resumption.differences(before, manifest(system, rate=4.0, run_id="s")) == ""
+    assert "seed is 2, expected 1" in resumption.differences(before, manifest(system, seed=2))
+    assert "mission is 'A', expected 'AB'" in resumption.differences(
         before, manifest(system, options={"mission": "A"}))
-    assert "ftm" in differences(before, manifest(system, ftm=False))
+    assert "ftm" in resumption.differences(before, manifest(system, ftm=False))
     system.write_text("name = 'y'")
-    assert f"{system} has changed" in differences(before, manifest(system))
+    assert f"{system} has changed" in resumption.differences(before, manifest(system))
 
 
 def test_the_newest_memory_is_recalled_unless_it_is_damaged_until_the_run_has_ended(
         tmp_path, system):
-    files, recalled = RunFiles(tmp_path), list[bytes]()
+    files, recalled = resumption.RunFiles(tmp_path), list[bytes]()
 
     def recall(memory: bytes) -> float:
         if memory == b"\xc1":
@@ -142,7 +134,7 @@ def test_a_run_that_did_not_start_leaves_the_one_before_it_as_it_was(tmp_path, s
         files.save(manifest(system))
         files.put_back(saved)
         if before is None:
-            assert not (files.directory / MANIFEST).exists()
+            assert not (files.directory / resumption.MANIFEST).exists()
         else:
             assert files.manifest() == before
-            (files.directory / MANIFEST).unlink()
+            (files.directory / resumption.MANIFEST).unlink()
