@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 from shapely.geometry import box
@@ -36,12 +36,11 @@ SOURCES = {"gps": topics.GPS, "imu": topics.IMU, "odom": topics.ODOMETRY,
 STAMPED = (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE)
 
 
-def sensor_faults(*sensors: str) -> list[str]:
-    """Names of the faults of these sensors, and of their topics, by the names in `SOURCES`."""
-    named = [name for name in SENSOR_FAULTS if name.startswith(sensors)]
-    keys = [SOURCES[sensor].key for sensor in sensors]
+def sensor_faults() -> list[str]:
+    """Names of the faults of the `SOURCES`, and of their topics."""
+    named = [name for name in SENSOR_FAULTS if name.startswith(tuple(SOURCES))]
     ways = ("drop", "freeze", "delay", "corrupt")
-    return named + [f"{way}:{key}" for way in ways for key in keys]
+    return named + [f"{way}:{topic.key}" for way in ways for topic in SOURCES.values()]
 
 
 # Seconds, m/s, rad/s: standing, straight, a bend, on the spot, backwards, a fast bend, standing.
@@ -193,11 +192,7 @@ def _altered(items: Items, topic: Topic[Any], from_s: float,
 # ---- who reads it --------------------------------------------------------------------------------
 
 
-class Onlooker(Protocol):
-    def take(self, now_s: float, item: Reading | Truth) -> None: ...
-
-
-def watch(items: Items, *onlookers: Onlooker, to_s: float = math.inf) -> None:
+def watch(items: Items, *onlookers: Located | Voted | Accused, to_s: float = math.inf) -> None:
     for now_s, item in items:
         if now_s > to_s:
             break
@@ -262,14 +257,10 @@ class Voted:
             self.unknown_s = max(self.unknown_s, now_s - self.seen_s)
             return
         where, body, stamp_s = self.where, item.body, item.stamp_s
-        if item.topic is topics.IMU:
-            where.vote.track.imu(body, stamp_s, now_s)
-        elif item.topic is topics.ODOMETRY:
-            where.odometry(body, stamp_s, now_s)
-        elif item.topic is topics.GPS:
-            where.gps(body, stamp_s, now_s)
-        elif item.topic is topics.BASE_STATUS:
-            where.vote.see_encoders(body, stamp_s, now_s)
+        take = {topics.IMU: where.vote.track.imu, topics.ODOMETRY: where.odometry,
+                topics.GPS: where.gps, topics.BASE_STATUS: where.vote.see_encoders}
+        if item.topic in take:
+            take[item.topic](body, stamp_s, now_s)
         else:
             where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s, body.yaw_rad)
         if item.topic is topics.GPS or now_s - self.looked_s >= 0.1:
@@ -303,14 +294,11 @@ class Accused:
             said = self.lie(item, now_s)
             if said is not None:
                 monitor.pose(said, now_s, now_s, "localization#1")
-        elif item.topic is topics.IMU:
-            monitor.vote.track.imu(item.body, item.stamp_s, now_s)
-        elif item.topic is topics.ODOMETRY:
-            monitor.vote.track.odometry(item.body, item.stamp_s, now_s)
-        elif item.topic is topics.BASE_STATUS:
-            monitor.vote.see_encoders(item.body, item.stamp_s, now_s)
-        elif item.topic is topics.GPS:
-            monitor.gps(item.body, item.stamp_s, now_s)
+        elif item.topic is not topics.ABSOLUTE_POSE:
+            take = {topics.IMU: monitor.vote.track.imu, topics.GPS: monitor.gps,
+                    topics.ODOMETRY: monitor.vote.track.odometry,
+                    topics.BASE_STATUS: monitor.vote.see_encoders}
+            take[item.topic](item.body, item.stamp_s, now_s)
         under_way = bool(self.spans) and self.spans[-1][1] == math.inf
         if monitor.active and not under_way:
             self.spans.append((now_s, math.inf))

@@ -50,7 +50,7 @@ def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, blind=(), inspection=N
 
 def test_the_robot_waits_for_an_obstacle_and_resumes_a_moment_after_it_is_gone():
     world = World(circles=[Circle(10.0, 0.0, 0.4)])
-    row = LightRow(WAY)
+    row = LightRow(WAY, edge_m=lambda _x, _y: 9.0)
     waiting = drive(world, row, 20)
     assert waiting.waiting
     assert world.linear_mps == 0.0
@@ -62,15 +62,15 @@ def test_the_robot_waits_for_an_obstacle_and_resumes_a_moment_after_it_is_gone()
     assert drive(world, row, 60).arrived
 
 
-def passing_row(pass_after_s=5.0, half_width_m=2.75):
-    return LightRow(WAY, limits=RowLimits(pass_after_s=pass_after_s),
+def passing_row(half_width_m):
+    return LightRow(WAY, limits=RowLimits(pass_after_s=5.0),
                     edge_m=lambda _x, y: half_width_m - abs(y))
 
 
 @pytest.mark.parametrize("aside_m", [-0.4, 0.0])
 def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_behind_it(aside_m):
     world = World(circles=[Circle(12.0, aside_m, 0.4)])
-    motion = drive(world, passing_row(), 70.0)
+    motion = drive(world, passing_row(2.75), 70.0)
     assert motion.arrived
     assert world.least_clearance_m >= 0.2
     assert max(abs(y) for _, y in world.track) <= 1.45
@@ -79,13 +79,11 @@ def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_b
     assert max(behind) <= 0.25, "on the row again soon"
 
 
-@pytest.mark.parametrize(("follower", "aside_m"), [
-    (lambda: LightRow(WAY), (0.0,)), (lambda: passing_row(half_width_m=1.3), (0.0,)),
-    (passing_row, (-2.0, -1.0, 0.0, 1.0, 2.0))],
-    ids=["as in the paper", "no room on the pavement", "both sides are blocked"])
-def test_else_it_waits_and_touches_nothing(follower, aside_m):
+@pytest.mark.parametrize(("half_width_m", "aside_m"), [(1.3, (0.0,)), (2.75, (-2, -1, 0, 1, 2))],
+                         ids=["no room on the pavement", "both sides are blocked"])
+def test_else_it_waits_and_touches_nothing(half_width_m, aside_m):
     world = World(circles=[Circle(12.0, y_m, 0.4) for y_m in aside_m])
-    motion = drive(world, follower(), 30.0)
+    motion = drive(world, passing_row(half_width_m), 30.0)
     assert not motion.arrived
     assert motion.linear_mps == 0.0
     assert world.least_clearance_m >= 0.2

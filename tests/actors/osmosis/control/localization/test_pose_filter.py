@@ -112,7 +112,7 @@ def assert_borne(located: trip.Located, voted: trip.Voted, accused: trip.Accused
     assert accused.spans == []
 
 
-@pytest.mark.parametrize("name", trip.sensor_faults(*trip.SOURCES))
+@pytest.mark.parametrize("name", trip.sensor_faults())
 @pytest.mark.parametrize("how", ["permanent", *(
     pytest.param(how, marks=pytest.mark.nightly) for how in ("transient", "intermittent"))])
 def test_any_single_fault_of_a_source_is_borne_by_all_who_read_it(name, how):
