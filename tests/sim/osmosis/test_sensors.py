@@ -14,15 +14,8 @@ import shapely
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport import model
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.airport.model import (
-    Airport,
-    Building,
-    Light,
-    ObstaclePreset,
-    StartPose,
-    WorldTruth,
-)
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_per_candela
 from rampart.actors.runtime.actor import Header
 from rampart.sim.osmosis.sensors import LaserSpec, LightSensor, wrap
@@ -31,8 +24,8 @@ from rampart.sim.osmosis.world import World
 from tests.sim.osmosis.bench import FIELD, Bench, world
 
 
-def field(yaw_rad: float = 0.0, **changes) -> Airport:
-    return replace(FIELD, start=StartPose(0, 0, yaw_rad), **changes)
+def field(yaw_rad: float = 0.0, **changes) -> model.Airport:
+    return replace(FIELD, start=model.StartPose(0, 0, yaw_rad), **changes)
 
 
 def towards(sim: World, ranges: np.ndarray, bearing_rad: float) -> float:
@@ -48,7 +41,7 @@ def towards(sim: World, ranges: np.ndarray, bearing_rad: float) -> float:
     ("box", 2.0, -2.0, 0.5, 0.0), ("box", 2.0, -2.0, 0.5, -2.5)])
 def test_the_laser_measures_the_distance_to_an_obstacle_from_the_robots_centre(
         shape, x_m, y_m, radius_m, yaw_rad):
-    preset = ObstaclePreset("o", shape, x_m, y_m, radius_m)
+    preset = model.ObstaclePreset("o", shape, x_m, y_m, radius_m)
     sim = world(field(yaw_rad, obstacles=(preset,)), obstacles=1, laser=LaserSpec(noise_m=0.0))
     # The ray nearest to the bearing, cut with the outline by GEOS.
     bearing = wrap(math.atan2(y_m, x_m) - yaw_rad)
@@ -60,7 +53,7 @@ def test_the_laser_measures_the_distance_to_an_obstacle_from_the_robots_centre(
 
 
 def test_laser_and_gps_have_the_stated_noise_and_no_bias():
-    sim = world(field(buildings=(Building("Wall", 3.1, 0.0, 0.2, 4.0, 3.0),)))
+    sim = world(field(buildings=(model.Building("Wall", 3.1, 0.0, 0.2, 4.0, 3.0),)))
     for errors, sigma_m in (
             ([towards(sim, sim.scan(), 0.0) - 3.0 for _ in range(400)], sim.laser.noise_m),
             ([sim.gps().x_m for _ in range(500)], 0.02)):
@@ -106,11 +99,11 @@ def test_odometry_is_good_on_the_straight_and_starts_at_its_own_origin():
 
 # ---- light sensor -------------------------------------------------------------------
 
-ROW = (Light("L1", "L", 2.0, 0.0, 200), Light("L2", "L", 6.0, 0.0, 200))
+ROW = (model.Light("L1", "L", 2.0, 0.0, 200), model.Light("L2", "L", 6.0, 0.0, 200))
 
 
 def test_illuminance_is_the_sum_of_the_real_lights_seen_from_the_bracket():
-    truth = WorldTruth({"L1": 0.5})
+    truth = model.WorldTruth({"L1": 0.5})
     sensor = LightSensor(field(lights=ROW), truth, np.random.default_rng(0))
     pose = (2.0 - SENSOR_FORWARD_M - 0.3, 0.0, 0.0)
     expected = 100 * illuminance_per_candela(0.3) + 200 * illuminance_per_candela(4.3)

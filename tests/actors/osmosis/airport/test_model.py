@@ -11,16 +11,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rampart.actors.osmosis.airport import model
 from rampart.actors.osmosis.airport.formats import load_airport, mission_problems, problems
-from rampart.actors.osmosis.airport.model import (
-    Airport,
-    Light,
-    Mission,
-    MissionGoal,
-    ObstaclePreset,
-    StartPose,
-    rectangle,
-)
 from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, illuminance_per_candela
 from rampart.actors.osmosis.control.planning.route_search import plan_route
 
@@ -30,12 +22,12 @@ NODES = {"SW": (3.0, 3.0), "SE": (17.0, 3.0), "NE": (17.0, 17.0), "NW": (3.0, 17
 EDGES = (("SW", "SE"), ("SE", "NE"), ("NE", "NW"))
 
 
-def airport(**changes) -> Airport:
-    made = Airport("Ring", NODES, EDGES, RING, StartPose(3, 3, 0))
+def airport(**changes) -> model.Airport:
+    made = model.Airport("Ring", NODES, EDGES, RING, model.StartPose(3, 3, 0))
     return replace(made, **changes)
 
 
-def findings(made: Airport) -> list[str]:
+def findings(made: model.Airport) -> list[str]:
     return [f"{found.field}: {found.remedy}" for found in problems(made)]
 
 
@@ -48,30 +40,30 @@ def test_distance_to_the_prohibited_area_agrees_with_geos(x, y):
 
 def test_a_footprint_is_in_the_prohibited_area_as_soon_as_one_corner_is():
     made = airport()
-    assert not made.footprint_in_prohibited(rectangle(0.5, 10, 0, 0.72, 0.614))
-    assert made.footprint_in_prohibited(rectangle(0.35, 10, 0, 0.72, 0.614))
+    assert not made.footprint_in_prohibited(model.rectangle(0.5, 10, 0, 0.72, 0.614))
+    assert made.footprint_in_prohibited(model.rectangle(0.35, 10, 0, 0.72, 0.614))
     # The centre is 0.45 m from the edge: straight it fits, turned its corner is over.
-    assert not made.footprint_in_prohibited(rectangle(0.45, 10, math.pi / 2, 0.72, 0.614))
-    assert made.footprint_in_prohibited(rectangle(0.45, 10, 0.7, 0.72, 0.614))
+    assert not made.footprint_in_prohibited(model.rectangle(0.45, 10, math.pi / 2, 0.72, 0.614))
+    assert made.footprint_in_prohibited(model.rectangle(0.45, 10, 0.7, 0.72, 0.614))
 
 
 @pytest.mark.parametrize(("changes", "expected"), [
-        ({"nodes": {}, "edges": ()}, "nodes: a graph needs at least one node"),
-        ({"edges": (("SW", "XX"),)}, "edges[0]: unknown node"),
-        ({"edges": (("SW", "SW"),)}, "edges[0]: expected two different nodes"),
-        ({"edges": (*EDGES, ("SE", "SW"))}, "edges: duplicate edge"),
-        ({"nodes": {**NODES, "NW": (10.0, 10.0)}}, "nodes.NW: in the prohibited area"),
-        ({"edges": (*EDGES, ("SW", "NE"))}, "edges[3]: passes through the prohibited area"),
-        ({"nodes": {**NODES, "SE": (17.0, 0.2), "SW": (3.0, 0.2)}, "start": StartPose(3, 2, 0)},
-         "edges[0]: too near to the prohibited area"),
-        ({"start": StartPose(10, 10, 0)}, "start: in the prohibited area"),
-        ({"start": StartPose(3, 10, 0), "nodes": {"NE": (17.0, 17.0)}, "edges": ()},
-         "start: 15.7 m from the graph"),
-        ({"lights": (Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
-        ({"lights": (Light("L1", "L", 3, 3, 1),) * 2}, "row: duplicate name of a light"),
-        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3),) * 2}, "obstacle: duplicate name"),
-        ({"obstacles": (ObstaclePreset("o", "box", 3.2, 3, 0.3),)}, "obstacle.o: on the start"),
-        ({"allowed": shapely.Polygon()}, "surface: the airport needs pavement"),
+    ({"nodes": {}, "edges": ()}, "nodes: a graph needs at least one node"),
+    ({"edges": (("SW", "XX"),)}, "edges[0]: unknown node"),
+    ({"edges": (("SW", "SW"),)}, "edges[0]: expected two different nodes"),
+    ({"edges": (*EDGES, ("SE", "SW"))}, "edges: duplicate edge"),
+    ({"nodes": {**NODES, "NW": (10.0, 10.0)}}, "nodes.NW: in the prohibited area"),
+    ({"edges": (*EDGES, ("SW", "NE"))}, "edges[3]: passes through the prohibited area"),
+    ({"nodes": {**NODES, "SE": (17.0, 0.2), "SW": (3.0, 0.2)}, "start": model.StartPose(3, 2, 0)},
+     "edges[0]: too near to the prohibited area"),
+    ({"start": model.StartPose(10, 10, 0)}, "start: in the prohibited area"),
+    ({"start": model.StartPose(3, 10, 0), "nodes": {"NE": (17.0, 17.0)}, "edges": ()},
+     "start: 15.7 m from the graph"),
+    ({"lights": (model.Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
+    ({"lights": (model.Light("L1", "L", 3, 3, 1),) * 2}, "row: duplicate name of a light"),
+    ({"obstacles": (model.ObstaclePreset("o", "box", 9, 3, 0.3),) * 2}, "obstacle: duplicate name"),
+    ({"obstacles": (model.ObstaclePreset("o", "box", 3.2, 3, 0.3),)}, "obstacle.o: on the start"),
+    ({"allowed": shapely.Polygon()}, "surface: the airport needs pavement"),
 ])
 def test_each_fault_of_an_airport_is_found_and_named(changes, expected):
     assert findings(airport()) == []
@@ -87,7 +79,7 @@ SPLIT = (("SW", "SE"), ("NE", "NW"))
     (((7, 5), (6.4, 6.0)), EDGES, "missions.M.goals[1]: in the prohibited area"),
     (((17, 3), (17, 17)), SPLIT, "missions.M.goals[1]: not connected")])
 def test_each_fault_of_a_mission_is_found_and_named(goals, edges, expected):
-    mission = Mission("M", tuple(MissionGoal(x_m, y_m, "taxi") for x_m, y_m in goals))
+    mission = model.Mission("M", tuple(model.MissionGoal(x_m, y_m, "taxi") for x_m, y_m in goals))
     found = [f"{p.field}: {p.remedy}" for p in mission_problems(mission, airport(edges=edges))]
     assert any(line.startswith(expected) for line in found)
 
