@@ -14,7 +14,7 @@ from rampart.actors.foreign.descendants import descendants
 from rampart.actors.supervision.kill_node import signal_node
 from rampart.actors.supervision.process_title import process_state
 from rampart.testing import RealRun
-from tests.documents.test_foreign_nodes import nodes
+from tests.documents.test_authors import nodes
 from tests.tug import TUG, write_tug
 
 pytestmark = pytest.mark.processes
