@@ -117,34 +117,34 @@ def run(tmp_path_factory):
 
 
 @contextlib.contextmanager
-def serving(*arguments: str, ready: str):
-    """Run a verb that serves; yields what it says after `ready`."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rampart.cli.main", *arguments], stdout=subprocess.PIPE, text=True,
-        cwd=ROOT)
+def started(*arguments: str, stdout):
+    """Run a verb until the end of the block."""
+    process = subprocess.Popen([sys.executable, "-m", "rampart.cli.main", *arguments],
+                               stdout=stdout, text=True, cwd=ROOT)
     try:
-        line = process.stdout.readline()
-        assert ready in line
-        yield line.split(ready)[1].strip(), process
+        yield process
     finally:
         process.terminate()
         process.communicate(timeout=15)
 
 
 @contextlib.contextmanager
+def serving(*arguments: str, ready: str):
+    """Run a verb that serves; yields what it says after `ready`."""
+    with started(*arguments, stdout=subprocess.PIPE) as process:
+        line = process.stdout.readline()
+        assert ready in line
+        yield line.split(ready)[1].strip(), process
+
+
+@contextlib.contextmanager
 def echo(run: RealRun, topic: str):
     """Collect what is sent on a topic; yields a function that returns all of it so far."""
     out = run.directory / "echo"
-    with out.open("w") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rampart.cli.main", "topic", "echo", topic, "--json",
-             "--port", str(run.port)], stdout=file, cwd=ROOT)
-    try:
+    with out.open("w") as file, started(
+            "topic", "echo", topic, "--json", "--port", str(run.port), stdout=file):
         yield lambda: [json.loads(line) for line in out.read_text().splitlines(keepends=True)
                        if line.endswith("\n")]
-    finally:
-        process.terminate()
-        process.wait(10)
 
 
 def twist(message: dict) -> tuple[float, float]:

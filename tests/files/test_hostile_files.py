@@ -86,38 +86,27 @@ def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, refused
 # -- graphs and masks ------------------------------------------------------------------------------
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return (struct.pack(">I", len(data)) + kind + data
-            + struct.pack(">I", zlib.crc32(kind + data)))
-
-
-def png_of(columns: int, rows: int, data: bytes = b"") -> bytes:
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(data))
-            + chunk(b"IEND", b""))
-
-
-def png_noise(side: int) -> bytes:
-    red = np.random.default_rng(1).integers(0, 2, (side, side)).astype(np.uint8)
-    image = Image.fromarray(red, "P")
-    image.putpalette([0, 255, 0, 255, 0, 0])
+def png(red: np.ndarray) -> bytes:
+    """Return an image that is red where an array is true, and green elsewhere."""
     out = io.BytesIO()
-    image.save(out, "PNG", bits=1)
+    Image.fromarray(np.where(red[..., None], (255, 0, 0), (0, 255, 0)).astype(np.uint8)
+                    ).save(out, "PNG")
     return out.getvalue()
 
 
-def png_good() -> bytes:
-    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
-    pixels[..., 0] = 255
-    pixels[40:80, 10:110] = (0, 255, 0)
-    out = io.BytesIO()
-    Image.fromarray(pixels).save(out, "PNG")
-    return out.getvalue()
+def png_of(columns: int, rows: int) -> bytes:
+    """Return an image whose head says another size than it has."""
+    head = b"IHDR" + struct.pack(">II", columns, rows) + GOOD[24:29]
+    return GOOD[:12] + head + struct.pack(">I", zlib.crc32(head)) + GOOD[33:]
+
+
+GOOD = png(np.pad(np.zeros((40, 100), bool), ((40, 40), (10, 10)), constant_values=True))
+NOISE = png(np.random.default_rng(1).random((1000, 1000)) < 0.5)
 
 
 def foreign(folder: Path, image: bytes | None = None, graph: str = json.dumps(GRAPH),
             mission: str = "x=9.5,y=6,taxi=1\n") -> str:
-    (folder / "field_area.png").write_bytes(image or png_good())
+    (folder / "field_area.png").write_bytes(image or GOOD)
     (folder / "field.graph").write_text(graph)
     (folder / "MISSION_A.miss").write_text(mission)
     return str(folder / "field.graph")
@@ -126,7 +115,7 @@ def foreign(folder: Path, image: bytes | None = None, graph: str = json.dumps(GR
 FOREIGN = {
     "50,000 x 50,000 pixels": ({"image": png_of(50_000, 50_000)}, "at most 16777216"),
     "no rows": ({"image": png_of(100, 0)}, "unreadable"),
-    "noise": ({"image": png_noise(1000)}, "more than 100000 runs"),
+    "noise": ({"image": NOISE}, "more than 100000 runs"),
     "a graph nested without end": ({"graph": '{"nodes":' + "[" * 100_000}, "expected a graph"),
     "a node far away": ({"graph": '{"nodes":[{"id":"N","x":1e9,"y":0}],"edges":[]}'},
                         "<= 1000000.0 - at `$.nodes[0].x`"),

@@ -10,6 +10,7 @@ from rampart.cli.main import main
 from tests import CELL
 
 TEXT = CELL.read_text(encoding="utf-8")
+CAMERA = 'name = "camera"\nactor = "rampart.actors.runtime.stub_node:StubNode"'
 
 
 def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
@@ -27,12 +28,10 @@ def test_a_sound_system_for_scripts(capsys):
 
 BROKEN = {
     "syntax": (("[orders.safer]", "[orders.safer"), "$: "),
-    "class": (('name = "camera"\nactor = "rampart.actors.runtime.stub_node:StubNode"',
-               'name = "camera"\nactor = "rampart.actors.runtime.stub_node:StubNod"'),
+    "class": ((CAMERA, CAMERA.replace("StubNode", "StubNod")),
               "node camera: actor = 'rampart.actors.runtime.stub_node:StubNod': no such actor "
               "class; known: StubNode"),
-    "module": (('name = "camera"\nactor = "rampart.actors.runtime.stub_node:StubNode"',
-                'name = "camera"\nactor = "no_such_module:Camera"'),
+    "module": ((CAMERA, 'name = "camera"\nactor = "no_such_module:Camera"'),
                "node camera: actor = 'no_such_module:Camera': No module named 'no_such_module'"),
     "application": (('title = "Pick and place behind a light curtain"',
                      'title = "x"\napplication = { class = "nothing:There" }'),
@@ -81,7 +80,7 @@ def test_what_a_system_is_for_scripts(capsys):
 
 def with_command(name: str, timeout_s: float) -> str:
     """The cell with a command in place of a node, with a timeout of its own heartbeat."""
-    actor = f'name = "{name}"\nactor = "rampart.actors.runtime.stub_node:StubNode"'
+    actor = CAMERA.replace("camera", name)
     assert TEXT.count(actor) == 1
     return TEXT.replace(actor, f'name = "{name}"\ncommand = ["sleep", "1000"]\n'
                                f'heartbeat = {{ key = "alive", timeout_s = {timeout_s} }}')

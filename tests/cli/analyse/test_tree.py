@@ -121,22 +121,16 @@ def test_the_hasse_diagram_holds_neighbours_only_and_says_as_much_as_the_order(p
 HOSTILE = '</text><script>alert("1")</script> & "quoted" \\N \\" \x1b[31m \u202e \x00 ]]> -->\n|{}'
 
 
-def hostile_system(tmp_path):
-    text = systems.DEFAULT.read_text(encoding="utf-8")
-    for title in ("Erroneous graph", "Emergency stop", "Runway light inspection with a Summit XL"):
-        text = text.replace(f'"{title}"', json.dumps(HOSTILE))
-    text = text.replace('order = "safer"', f"order = {json.dumps(HOSTILE)}")
-    text = text.replace("[orders.safer]", f"[orders.{json.dumps(HOSTILE)}]")
-    file = tmp_path / "hostile.toml"
-    file.write_text(text, encoding="utf-8")
-    return file
-
-
 def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path):
-    tree = ["tree", "--system", str(hostile_system(tmp_path))]
+    text = systems.DEFAULT.read_text(encoding="utf-8")
+    for word in ("Erroneous graph", "Emergency stop", "Runway light inspection with a Summit XL",
+                 "safer"):
+        text = text.replace(f'"{word}"', json.dumps(HOSTILE))
+    file = tmp_path / "hostile.toml"
+    file.write_text(text.replace("[orders.safer]", f"[orders.{json.dumps(HOSTILE)}]"))
     shown = []
     for more in ((), ("--json",)):
-        assert main([*tree, *more]) == 0
+        assert main(["tree", "--system", str(file), *more]) == 0
         shown.append(told(capsys))
         assert not {"\x1b", "\x00", "\u202e"} & set(shown[-1])
     assert f"├── erroneous_graph  {one_line(HOSTILE)}" in shown[0].splitlines()
