@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz import file_targets, target, wire_targets  # noqa: F401 they register
+from tests.fuzz import target, targets  # noqa: F401 they register
 from tests.fuzz.inputs import inputs
 from tests.fuzz.target import ALL, CORPUS, LAST, SlowError, Target, UnsoundError
 
