@@ -18,7 +18,6 @@ from rampart.actors.ros2.stand_in import StandIn
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.system.members import load_class
 from rampart.cli.main import main
-from rampart.manager.model.gates import detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.schema import (
     BlackBox,
@@ -129,13 +128,6 @@ def test_the_judge_that_it_shows_judges(tmp_path, brim_m, safe, margin_m, why):
     assert done.judgement.safe is done.judgement.success is safe
     assert done.judgement.margins == {"brim": pytest.approx(margin_m)}
     assert (done.record.duration_s > 599) == safe
-
-
-@pytest.mark.parametrize("text", ["DM1 and DM3", "DM1 or (DM2 and not DM3)",
-                                  "2 of (DM1, DM2, DM3)"])
-def test_the_gates_it_shows_are_gates(text):
-    assert f"`{text}`" in PAGE.text
-    assert str(detection_gate(text)) == text
 
 
 ROS2 = Page("reference/ros2")

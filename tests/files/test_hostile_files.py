@@ -25,7 +25,7 @@ from rampart.cli.main import main as rampart
 from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.sim.campaign.job import Job
-from rampart.sim.campaign.store import Store, StoreError
+from rampart.sim.campaign.store import Store
 from tests import ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 
@@ -217,16 +217,6 @@ def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, refused, da
         database.execute(damage)
     database.close()
     refused("campaign", "--replay", "abc", "--out", tmp_path)
-
-
-def test_a_store_with_a_damaged_row_says_so_when_it_is_read(tmp_path):
-    store = Store(tmp_path)
-    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
-        database.execute("insert into runs (key, job, result) values ('abc', x'c1', x'c1')")
-    database.close()
-    with pytest.raises(StoreError, match="cannot be used"):
-        list(store.runs())
-    store.close()
 
 
 def test_a_document_of_a_recording_is_bounded_like_a_file():

@@ -8,8 +8,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz import target, targets  # noqa: F401 they register
-from tests.fuzz.inputs import inputs
-from tests.fuzz.target import ALL, CORPUS, LAST, SlowError, Target, UnsoundError
+from tests.fuzz.target import ALL, CORPUS, LAST, SlowError, Target, UnsoundError, inputs
 
 pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
 

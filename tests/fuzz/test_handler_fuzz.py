@@ -50,9 +50,8 @@ from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 from rampart.testing import VirtualSystem, run
 from tests import system_file
-from tests.fuzz.inputs import Draw
 from tests.fuzz.message_extremes import all_topics, pack, values
-from tests.fuzz.target import limits, restart_limit
+from tests.fuzz.target import Draw, limits, restart_limit
 
 pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
 
