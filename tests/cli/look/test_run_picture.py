@@ -34,8 +34,7 @@ from rampart.cli.look.live_foxglove import _watch
 from rampart.cli.look.live_metrics import Exposition, families
 from rampart.cli.look.top import Frame, screen
 from rampart.cli.osmosis.lines import OsmosisLines
-from rampart.cli.run_picture import RunPicture, draw
-from rampart.systems import DEFAULT
+from rampart.cli.run_picture import RunPicture
 from rampart.testing import free_port
 from tests import ROOT
 
@@ -136,17 +135,6 @@ def test_an_activity_is_counted_when_it_begins():
         told(picture, ftm_topics.RECOVERY, fm.RecoveryReport(
             fm.RecoveryState(state), fm.RecoveryPhase.ACTING, 1, ""), "RM1")
     assert (picture.detections_total["DM1"], picture.recoveries_total["RM1"]) == (2, 1)
-
-
-def test_every_topic_is_either_read_or_counted():
-    read, counted, picture = [], [], RunPicture()
-    draw(SimpleNamespace(
-        run=RunInfo(1, 7450, 1.0, 0.0, str(DEFAULT), "", (), "run", 0, ""), clock=Clock(0.0),
-        listen=lambda topic, *_: read.append(topic),
-        overhear=lambda topic, *_: counted.append(topic)), picture)
-    assert {t.key for t in read} >= {topics.POSE.key, ftm_topics.NODES.key}
-    assert sorted(t.key for t in (*read, *counted)) == sorted(t.key for t in topics.ALL)
-    assert isinstance(picture.lines, OsmosisLines)
 
 
 WHEELS = (0.0, 0.0, 0.0, 0.0)
