@@ -28,7 +28,7 @@ def test_every_option_has_a_meaning_every_verb_an_example_and_old_names_are_left
     for name, _, said in (part.partition("\n")
                           for part in re.split(r"^#{3,} ", text, flags=re.MULTILINE)[1:-1]):
         assert " ".join(name.split()[:2]) in said.partition("examples:")[2], name
-        assert not said.lstrip().startswith(("|", "```text\nexamples:")), f"{name} has no description"
+        assert not said.lstrip().startswith(("|", "```text\nexamples:")), f"describe {name}"
     assert not re.findall(r"^\| `.*` \|\s*\|$", text, re.MULTILINE)
     headings = set(re.findall(r"^#+ (.*)$", text, re.MULTILINE))
     assert {"rampart run", "rampart node list", "rampart campaign", "rampart mission"} <= headings
