@@ -3,6 +3,8 @@
 import pytest
 
 from rampart.actors.operator import stick_arbitration
+from rampart.actors.supervision.kill_node import UnknownNodeError
+from rampart.actors.supervision.process_title import RunProcess
 from tests.actors.operator.browser import browser
 from tests.actors.operator.world import World, open_page, served
 
@@ -42,3 +44,18 @@ async def tab():
 def patient(monkeypatch):
     """Let a page of a busy machine not count as silent, where time is not the subject."""
     monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", 5.0)
+
+
+@pytest.fixture
+def signalled(monkeypatch):
+    """Nodes of this host that were signalled from a page, and how: no process is hit."""
+    sent = []
+
+    def signal_node(node, name, _port):
+        if node not in ("localization", "osmosis_control", "hmi"):
+            raise UnknownNodeError(f"unknown node {node!r}")
+        sent.append((node, name))
+        return RunProcess(77, 7450, 1, (node,), 1)
+
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
+    return sent

@@ -19,8 +19,6 @@ from rampart.actors.operator.stick_arbitration import FIRST_S, TIMEOUT_S, StickA
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.actors.supervision.kill_node import UnknownNodeError
-from rampart.actors.supervision.process_title import RunProcess
 from rampart.testing import eventually
 from tests.actors.operator.world import ask, hear, open_page, repeated, served, show, visited
 from tests.osmosis_system import shipped_system
@@ -129,16 +127,7 @@ async def test_the_page_says_whether_the_stick_has_an_effect_now(world, page):
 
 
 async def test_a_signal_is_sent_here_ordered_elsewhere_and_to_the_own_node_after_its_answer(
-        world, monkeypatch):
-    sent = []
-
-    def signal_node(node: str, name: str, _port: int) -> RunProcess:
-        if node not in ("localization", "hmi"):
-            raise UnknownNodeError(f"unknown node {node!r}")
-        sent.append((node, name))
-        return RunProcess(77, 7450, 1, (node,), 1)
-
-    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
+        world, signalled):
     async with visited(world, launcher_pid=1) as (_, page):
         world.others.publish(ftm_topics.NODES, fm.NodeTable((
             fm.NodeInfo("teleoperation", "control", 7, fm.NodeState.RUNNING, 1, 0, host="g"),
@@ -156,8 +145,8 @@ async def test_a_signal_is_sent_here_ordered_elsewhere_and_to_the_own_node_after
             told = await ask(page, type="signal", node=node, signal=name)
             assert told["type"] == kind
             assert text in told["text"]
-        assert sent == [("localization", "KILL")]
-        await eventually(lambda: sent[1:] == [("hmi", "KILL")])
+        assert signalled == [("localization", "KILL")]
+        await eventually(lambda: signalled[1:] == [("hmi", "KILL")])
         await eventually(lambda: [(one.node, one.signal) for one in world.others.signals] == [
             ("teleoperation", "KILL"), ("teleoperation", "STOP")])
         first, second = world.others.signals

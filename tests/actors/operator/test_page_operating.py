@@ -13,7 +13,6 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser, mouse
@@ -212,15 +211,7 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world, tab):
 @pytest.mark.parametrize("hmi", [{"launcher_pid": 1, "faults": OsmosisFaults().offered(),
                                   "system": shipped_system()}], indirect=True)
 async def test_a_node_is_signalled_by_a_second_press_a_strategy_chosen_and_a_fault_injected(
-        world, tab, monkeypatch):
-    sent = []
-
-    def signal_node(node: str, name: str, _port: int) -> RunProcess:
-        sent.append((node, name))
-        return RunProcess(77, 7450, 1, (node,), 1)
-
-    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
-
+        world, tab, signalled):
     row = "$('tr[data-node=osmosis_control]')"
     confirm = "$('#signal-confirm')"
     node = fm.NodeInfo("osmosis_control", "control", 77, fm.NodeState.RUNNING, 1, 0)
@@ -230,9 +221,9 @@ async def test_a_node_is_signalled_by_a_second_press_a_strategy_chosen_and_a_fau
         assert await tab.value(f"{confirm}.hidden") is True
         await tab.value("$$('#signals button').find((b) => b.textContent === 'KILL').click()")
         assert await tab.value(f"{confirm}.textContent") == "Send KILL to osmosis_control"
-        assert sent == []
+        assert signalled == []
         await tab.value(f"{confirm}.click()")
-        await eventually(lambda: sent == [("osmosis_control", "KILL")])
+        await eventually(lambda: signalled == [("osmosis_control", "KILL")])
         await tab.until("$('#toast').textContent === 'osmosis_control (pid 77): KILL'")
 
     await tab.until("!$('#strategy-set').disabled")

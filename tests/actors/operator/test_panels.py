@@ -112,9 +112,9 @@ def test_the_examples_of_the_document_are_sound(tmp_path):
     assert "/robot/pipes.js" in page_files(made["TankPage"].files)
 
 
-def caught(panels: str) -> ValueError:
+def caught(*texts: str) -> ValueError:
     with pytest.raises(ValueError, match=r".") as found:
-        layout(panels)
+        layout(*texts)
     return found.value
 
 
@@ -302,14 +302,12 @@ def node(kind: str) -> str:
     return f'[[node]]\nname = "{kind.lower()}"\nactor = "{__name__}:{kind}"\nkind = "control"\n'
 
 
-def laid_out(rest: str, *nodes: str, page: str = PAGE) -> Layout:
-    return layout(panel("Drive", rest) if rest else "", page + "".join(map(node, nodes)))
+def texts(rest: str, *nodes: str, page: str = PAGE) -> tuple[str, str]:
+    return panel("Drive", rest) if rest else "", page + "".join(map(node, nodes))
 
 
 def refused(rest: str, *nodes: str, **page: str) -> str:
-    with pytest.raises(ValueError, match=r".") as caught:
-        laid_out(rest, *nodes, **page)
-    return str(caught.value)
+    return str(caught(*texts(rest, *nodes, **page)))
 
 
 # ---- at load ------------------------------------------------------------------------------------
@@ -328,13 +326,13 @@ def test_the_page_publishes_what_its_stick_says_and_does_not_hear_it():
 
 def test_a_stick_of_the_page_s_class_or_of_a_member_of_a_family_has_its_topic_alone():
     own = PAGE.replace("rampart.actors.operator.hmi:Hmi", f"{__name__}:StickHmi")
-    assert "tank/hand" in published(laid_out("", "Needs", page=own).members["page"])
+    assert "tank/hand" in published(layout(*texts("", "Needs", page=own)).members["page"])
     assert refused("", "Driven", "Rival", page=own).startswith(
         "tank.toml: page: panel 'Hand': stick: node rival publishes 'tank/hand' as well, and may "
         "move what an operator let go")
     assert refused(FIELDS, "Driven", page=own) == (
         "tank.toml: page: panel 'Hand': another stick publishes tank/hand too; expected one")
-    found = laid_out('stick = ["tank/place/a:count"]', "Driven", "Commands")
+    found = layout(*texts('stick = ["tank/place/a:count"]', "Driven", "Commands"))
     assert published(found.members["page"])["tank/place/{name}"] == ("a",)
     assert "node commands publishes 'tank/place/b' as well, and may move what" in refused(
         'stick = ["tank/place/b:count"]', "Driven", "Commands")
