@@ -31,7 +31,6 @@ from tests.osmosis_system import run_context
 AIRPORT = load_airport("vallombre")
 FILE = system_file("osmosis")
 SPEC = parse_specification(FILE.read_text(encoding="utf-8"), FILE.name)
-RATE = 20.0
 TOKEN = "abcdefghijklmnop"
 LIVE = "$('#link').textContent === 'live'"
 
@@ -103,7 +102,7 @@ class World:
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
         self.hub = Hub()
-        self.clock = Clock(loop.time(), RATE, loop.time)
+        self.clock = Clock(loop.time(), 20.0, loop.time)
         self.others = Others(self.context("others", 1))
 
     def context(self, name: str, incarnation: int, **shared: object) -> Context:
@@ -165,12 +164,9 @@ async def served(hmi: OsmosisHmi) -> str:
 
 
 def open_page(at: str, token: str = "", path: str = "/ws", **options):
-    options.setdefault("additional_headers", bearer(token) if token else None)
+    if token:
+        options["additional_headers"] = {"Authorization": f"Bearer {token}"}
     return websockets.connect(f"ws://{at}{path}", **options)
-
-
-def bearer(token: str) -> dict[str, str]:
-    return {"Authorization": f"Bearer {token}"}
 
 
 @asynccontextmanager

@@ -20,7 +20,6 @@ from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessE
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine, AuditLog
 from rampart.manager.spec.budget import allowed_late_s
-from rampart.manager.spec.tables import Timing
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.curves import MOST, CurveRecorder
 from rampart.sim.runs.record import Interval, RunRecord, RunRecorder
@@ -174,10 +173,7 @@ def test_a_robot_without_regular_numbers_has_no_curves():
 # -- How late event loops were, and the rate with which the machine would have kept up --
 
 
-TIMING = Timing(
-    heartbeat_period_s=0.1, heartbeat_timeout_s=0.4, command_timeout_s=1.0,
-    localization_timeout_s=1.0, scan_timeout_s=0.5, dead_man_timeout_s=0.5, manager_timeout_s=1.0,
-    detection_silence_timeout_s=1.0)
+TIMING = shipped_system().timing
 
 
 def table(**late_s: float) -> NodeTable:
