@@ -185,38 +185,32 @@ def test_what_makes_no_sense_is_refused():
 
 # ---- a world that blows up, or dies: no judge has watched it to its end --------------------------
 
-BLOWS_UP_S = 3.0
+HARMED_S = 3.0
 
 
-@pytest.fixture
-def blowing_up(monkeypatch):
+def blow_up(sim: World) -> None:
+    if not sim.data.warning.number.any():
+        sim.data.qvel[0] = 1e12
+
+
+def die(_sim: World) -> None:
+    raise RuntimeError("died")
+
+
+@pytest.mark.parametrize(("harm", "within_s", "reason"), [
+    (blow_up, 0.5, "physics unstable"), (die, 1.0, "the world has died")])
+def test_a_run_whose_world_blows_up_or_dies_ends_at_once_and_is_neither_safe_nor_a_success(
+        monkeypatch, harm, within_s, reason):
     tick = World._tick
 
-    def blow_up(self):
-        if self.time_s >= BLOWS_UP_S and not self.data.warning.number.any():
-            self.data.qvel[0] = 1e12
+    def harmed(self):
+        if self.time_s >= HARMED_S:
+            harm(self)
         tick(self)
 
-    monkeypatch.setattr(World, "_tick", blow_up)
-
-
-@pytest.mark.usefixtures("blowing_up")
-def test_a_run_whose_world_blows_up_ends_at_once_and_is_neither_safe_nor_a_success():
+    monkeypatch.setattr(World, "_tick", harmed)
     done = virtual_run("paper", options={"mission": "A"})
     assert (done.record.mission, done.record.safety) == ("fail", "not known")
     assert (done.judgement.success, done.judgement.safe) == (False, None)
-    assert done.record.duration_s < BLOWS_UP_S + 0.5
-    assert done.record.reasons[0].startswith("physics unstable")
-
-
-def test_a_run_whose_world_dies_is_neither_safe_nor_a_success(monkeypatch):
-    tick = World._tick
-
-    def die(self):
-        if self.time_s >= BLOWS_UP_S:
-            raise RuntimeError("died")
-        tick(self)
-
-    monkeypatch.setattr(World, "_tick", die)
-    done = virtual_run("paper", options={"mission": "A"})
-    assert (done.record.mission, done.record.safety) == ("fail", "not known")
+    assert done.record.duration_s < HARMED_S + within_s
+    assert done.record.reasons[0].startswith(reason)
