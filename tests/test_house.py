@@ -111,8 +111,8 @@ def names_of_the_robot() -> set[str]:
     return (found | {topic.key for topic in topics.ROBOT}) - {"simulator", "hmi"}
 
 
-def naming() -> set[str]:
-    """Return the modules of the engine with a text that is a robot's name or class."""
+def test_the_engine_names_no_robot_in_texts_either():
+    """Docstrings and the examples of a help text may; what decides may not know a name."""
     robots = names_of_the_robot()
     found = set()
     for module, file in MODULES.items():
@@ -125,22 +125,11 @@ def naming() -> set[str]:
                     and id(node) not in shown \
                     and (node.value in robots or CLASS_OF_A_ROBOT.fullmatch(node.value)):
                 found.add(module)
-    return found
-
-
-def test_the_engine_names_no_robot_in_texts_either():
-    """Docstrings and the examples of a help text may; what decides may not know a name."""
-    assert naming() == set()
+    assert found == set()
 
 
 def test_no_circle_of_imports():
     TopologicalSorter({module: imports_of(module) for module in MODULES}).prepare()
-
-
-def the_map() -> str:
-    """Return the part of the architecture's page that says which code is where."""
-    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
-    return page.partition("## The house")[2].partition("\n## ")[0]
 
 
 def named(text: str) -> list[str]:
@@ -150,7 +139,9 @@ def named(text: str) -> list[str]:
 
 
 def test_the_map_of_the_house_names_every_room():
-    rows = [named(row) for row in re.findall(r"^\| (`.*?`) \|", the_map(), re.MULTILINE)]
+    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
+    house = page.partition("## The house")[2].partition("\n## ")[0]
+    rows = [named(row) for row in re.findall(r"^\| (`.*?`) \|", house, re.MULTILINE)]
     rooms = [room for row in rows for room in row]
     assert [room for room in rooms if not is_robot(room)] == list(ROOMS)
     assert {room for room in rooms if is_robot(room)} == {

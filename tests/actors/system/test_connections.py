@@ -225,6 +225,7 @@ def test_a_judge_that_cannot_judge(tank, said, line):
 
 
 FILE = "osmosis.toml"
+PLAN = RunPlan(seed=5, system_file=FILE)
 CHOSEN = collections.defaultdict(lambda: topics.COMMAND)
 """Any text may name a topic here; that there is one is checked when a system is loaded."""
 SPECS = {path.name: parse_specification(path.read_text("utf-8"), str(path))
@@ -238,10 +239,6 @@ VALUES = (-1, 0, 1, 2.5, True, "x", "done", "acting", "safety_pilot", "control/c
           ["osmosis_control", "osmosis_control"], ["safety_pilot", "standby_control"], ["RM1"])
 
 
-def plan(file: str) -> RunPlan:
-    return RunPlan(seed=5, system_file=file)
-
-
 def said(table: str, name: str, **parameters) -> SystemSpec:
     """The full system with other parameters of one module."""
     rows = tuple(msgspec.structs.replace(row, parameters={**row.parameters, **parameters})
@@ -251,19 +248,19 @@ def said(table: str, name: str, **parameters) -> SystemSpec:
 
 def refusal(spec: SystemSpec) -> str:
     with pytest.raises(SpecificationError) as caught:
-        Layout(plan(FILE), spec)
+        Layout(PLAN, spec)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
 def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
-    members = Layout(plan(FILE), said("nodes", "simulator", obstacles=1)).members
+    members = Layout(PLAN, said("nodes", "simulator", obstacles=1)).members
     assert members["RM4"].parameters.nodes == ("localization", "hmi", "teleoperation")
     world = members["simulator"].parameters
     assert (world.seed, world.obstacles, world.dead_man, world.upper_laser) == (5, 1, True, True)
     rows = tuple(msgspec.structs.replace(row, actor="rampart.actors.recovery.stub:StubRecovery")
                  if row.name == "RM4" else row for row in FULL_SPEC.recoveries)
-    members = Layout(plan(FILE), msgspec.structs.replace(FULL_SPEC, recoveries=rows)).members
+    members = Layout(PLAN, msgspec.structs.replace(FULL_SPEC, recoveries=rows)).members
     assert members["RM4"].parameters == StubRecovery.Parameters()
 
 

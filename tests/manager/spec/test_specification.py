@@ -6,10 +6,10 @@ against a simulated drive.
 
 import re
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rampart import SpecificationError, parse_specification
 from rampart.actors.foreign.program import check_programs
@@ -423,12 +423,8 @@ SPEC = paper()
 ROBOT = SPEC.robot
 
 
-def changed(table, **values):
-    return msgspec.structs.replace(table, **values)
-
-
 def with_timing(**values):
-    return changed(SPEC, timing=changed(SPEC.timing, **values))
+    return replace(SPEC, timing=replace(SPEC.timing, **values))
 
 
 def drive_m(robot, waiting_s: float, acceleration_mps2: float) -> float:
@@ -446,7 +442,7 @@ def drive_m(robot, waiting_s: float, acceleration_mps2: float) -> float:
 @settings(max_examples=10, deadline=None)
 @given(st.floats(0.3, 2.0), st.floats(0.5, 4.0), st.floats(0.5, 4.0), st.floats(3.0, 12.0))
 def test_who_waits_as_long_as_it_may_stops_right_at_the_edge(speed, accel, brake, clearance):
-    robot = changed(ROBOT, top_speed_mps=speed, acceleration_mps2=accel, braking_mps2=brake,
+    robot = replace(ROBOT, top_speed_mps=speed, acceleration_mps2=accel, braking_mps2=brake,
                     corridor_clearance_m=clearance + speed ** 2 / (2 * brake))
     for acceleration, waiting_s in ((accel, time_to_runaway_s(robot)),
                                     (0.0, time_to_drift_s(robot))):
@@ -455,15 +451,15 @@ def test_who_waits_as_long_as_it_may_stops_right_at_the_edge(speed, accel, brake
 
 
 def test_a_robot_that_cannot_even_brake_in_its_corridor_has_no_time():
-    robot = changed(ROBOT, corridor_clearance_m=0.2)
+    robot = replace(ROBOT, corridor_clearance_m=0.2)
     assert time_to_runaway_s(robot) == pytest.approx(time_to_drift_s(robot))
     assert time_to_runaway_s(robot) < 0
 
 
 def test_a_guard_that_is_switched_off_needs_no_time():
-    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
+    layers = replace(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
                      ftm=False)
-    assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
+    assert [b.name for b in check(replace(SPEC, layers=layers))] == ["safety_pilot"]
 
 
 def test_the_numbers_of_the_shipped_robot():
@@ -479,9 +475,9 @@ def test_the_numbers_of_the_shipped_robot():
 def test_only_a_repair_pays_for_the_respawn_and_a_given_command_timeout_moves_the_heartbeat():
     assert {b.name: b.respawn_s for b in check(SPEC) if b.respawn_s} == {
         "FTM4": 0.4, "FTM5": 0.4, "FTM7": 0.4}
-    timing = derive_timeouts(ROBOT, changed(Timing(), command_timeout_s=0.9))
+    timing = derive_timeouts(ROBOT, replace(Timing(), command_timeout_s=0.9))
     assert (timing.command_timeout_s, round(timing.heartbeat_timeout_s, 6)) == (0.9, 0.35)
-    timing = derive_timeouts(changed(ROBOT, corridor_clearance_m=20.0), Timing())
+    timing = derive_timeouts(replace(ROBOT, corridor_clearance_m=20.0), Timing())
     assert timing.heartbeat_timeout_s == 0.5, "at most five periods"
 
 
@@ -489,17 +485,17 @@ def test_only_a_repair_pays_for_the_respawn_and_a_given_command_timeout_moves_th
        stop=st.floats(0.3, 5.0))
 def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance, stop):
     """If there is time at all; otherwise they are so short that they are refused."""
-    robot = changed(ROBOT, top_speed_mps=speed, braking_mps2=brake, stop_distance_m=stop,
+    robot = replace(ROBOT, top_speed_mps=speed, braking_mps2=brake, stop_distance_m=stop,
                     corridor_clearance_m=clearance)
-    spec = changed(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
+    spec = replace(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
     detections = tuple(
-        changed(d, within_s=timeout_s, parameters=d.parameters | {"timeout_s": timeout_s})
+        replace(d, within_s=timeout_s, parameters=d.parameters | {"timeout_s": timeout_s})
         if "timeout_s" in d.parameters else d
         for d in SPEC.detections
         for timeout_s in [getattr(spec.timing, {
             "DM2": "command_timeout_s", "DM6": "localization_timeout_s"}.get(
                 d.name, "heartbeat_timeout_s"))])
-    spec = changed(spec, detections=detections)
+    spec = replace(spec, detections=detections)
     if list(find_false_alarms(spec.timing)):
         return
     late = {b.name for b in check(spec) if not b.fits}
