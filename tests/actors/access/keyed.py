@@ -1,7 +1,6 @@
 """A router with keys in the process of a test, sessions by any certificate, what they achieve."""
 
 import contextlib
-import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,17 +15,15 @@ from rampart.actors.supervision.root import reserve_ports
 from rampart.actors.system.layout import Layout
 from tests import ROOT
 
-PATIENCE_S = 20.0
-
 
 def layout_of(system: str) -> Layout:
     plan = RunPlan(system_file=str(systems.find(system)))
     return Layout(plan, load_system(plan))
 
 
-def make_keys(folder: Path, layout: Layout, addresses=()) -> Path:
+def make_keys(folder: Path, layout: Layout) -> Path:
     key_folder.init(folder)
-    key_folder.issue(folder, tuple(layout.routers), "router", addresses)
+    key_folder.issue(folder, tuple(layout.routers), "router")
     key_folder.issue(folder, tuple(layout.members), "node")
     key_folder.issue(folder, ("ada",), "operator")
     key_folder.issue(folder, ("bob",), "viewer")
@@ -61,13 +58,12 @@ def opened(config: zenoh.Config):
 class Keyed:
     """A router, and by whose certificate what can be done there."""
 
-    def __init__(self, folder: str, keys: Path, layout: Layout, where: str = "127.0.0.1"):
+    def __init__(self, folder: str, keys: Path, layout: Layout):
         self.folder, self.keys, self.layout = folder, keys, layout
         self._kept = reserve_ports(9_000)
         self.port = self._kept[0].getsockname()[1]
-        self.at = f"tls/{where}:{self.port}"
+        self.at = f"tls/127.0.0.1:{self.port}"
         self.socket = endpoint(folder, "router_a")
-        self._where = where
 
     def shown(self, name: str) -> Credentials:
         found = credentials_in(str(self.keys), name)
@@ -85,12 +81,3 @@ class Keyed:
 
     def joined(self, name: str, credentials: Credentials | None = None):
         return opened(session_config((), [self.socket], credentials or self.shown(name)))
-
-
-def wait_for(what, seconds: float = PATIENCE_S) -> bool:
-    end = time.monotonic() + seconds
-    while not what():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True

@@ -17,16 +17,8 @@ from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.topics import INJECT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
-from rampart.testing import free_port
-from tests.actors.access.keyed import (
-    Keyed,
-    covered,
-    every_key,
-    layout_of,
-    make_keys,
-    opened,
-    wait_for,
-)
+from rampart.testing import free_port, wait_until
+from tests.actors.access.keyed import Keyed, covered, every_key, layout_of, make_keys, opened
 from tests.two_hosts import two_hosts
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
@@ -74,7 +66,7 @@ def test_an_identity_publishes_its_declared_outputs_only(keyed):
                         session.delete(f"rampart/{key}")
                     return arrived[name] <= heard.of(name)
 
-                assert wait_for(tries), (name, arrived[name] - heard.of(name))
+                wait_until(tries, 20, name)
                 tries()
         assert {name: heard.of(name) for name in arrived} == arrived
         assert heard.of("") == set()  # nothing was deleted
@@ -94,9 +86,9 @@ def test_an_identity_receives_its_declared_inputs_only(keyed):
                         everybody.put(f"rampart/{key}", name)
                     return expected <= heard.of(name)
 
-                assert wait_for(is_there), (name, expected - heard.of(name))
-                assert wait_for(lambda heard=heard: everybody.put(INJECT.at(), "last")
-                                or "inject/order" in heard.of("last"))  # each one hears it
+                wait_until(is_there, 20, name)
+                wait_until(lambda heard=heard: everybody.put(INJECT.at(), "last")
+                           or "inject/order" in heard.of("last"), 20)  # each one hears it
                 assert heard.of(name) == expected, name
                 del held
 
@@ -118,7 +110,7 @@ def test_it_answers_for_its_own_topics_and_queries_its_inputs_only(keyed):
                                 consolidation=zenoh.ConsolidationMode.NONE)
                 assert found.keys() <= may_answer, name
                 one = min(may_answer)
-                assert wait_for(lambda one=one: replies(everybody, one)), (name, one)
+                wait_until(lambda one=one: replies(everybody, one), 20, f"{name}: {one}")
                 del held
         all_answers = everybody.declare_queryable(
             "rampart/**", lambda q: q.reply(q.key_expr, "answer"), complete=True)
@@ -126,7 +118,7 @@ def test_it_answers_for_its_own_topics_and_queries_its_inputs_only(keyed):
             asks = may(name, "queries")
             with keyed.joined(name) as session:
                 for key in sorted(asks)[:3]:
-                    assert wait_for(lambda key=key: replies(session, key)), (name, key)
+                    wait_until(lambda key=key: replies(session, key), 20, f"{name}: {key}")
                 others = [key for key in KEYS if key not in asks]
                 for key in others if name in {"DM4", "hmi"} else others[:3]:
                     assert not replies(session, key), (name, key)
@@ -219,7 +211,7 @@ def test_a_link_is_closed_when_its_certificate_expires(keyed):
         days=3 / 86_400))
     with keyed.joined("", short) as session:
         assert list(session.info.routers_zid())
-        assert wait_for(lambda: not list(session.info.routers_zid()))
+        wait_until(lambda: not list(session.info.routers_zid()), 20)
 
 
 def test_a_node_cannot_pose_as_a_router(keyed, folder):
@@ -261,7 +253,7 @@ def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(tmp_path, 
                 ground.put("rampart/detection/DM5", "own")
                 return "rampart/detection/DM5" in got
 
-            assert wait_for(arrived)
+            wait_until(arrived, 20)
             arrived()
             answers = [r for r in everybody.get("rampart/summit_xl/command", timeout=0.5)
                        if r.ok is not None]

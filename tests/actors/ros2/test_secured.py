@@ -16,15 +16,7 @@ from rampart.actors.ros2.wire import Qos
 from rampart.testing import RealRun, free_port, wait_until
 from tests import ROOT
 from tests.actors.ros2.test_gateway import configured
-from tests.cli.look.test_ros_verbs import (
-    EVERYTHING,
-    Robot,
-    make_credentials,
-    opened,
-    ports,
-    secured,
-    shown,
-)
+from tests.cli.look import test_ros_verbs as verbs
 from tests.real_tools import printed
 from tests.whole.network import network, why_not
 
@@ -38,9 +30,9 @@ LOST, BACK = "; the gateway goes on dialling", " again"
 
 def written(tmp_path, port):
     """Write the system of a gateway at a router with TLS, without the stand-in of the robot."""
-    make_credentials(tmp_path)
+    verbs.make_credentials(tmp_path)
     path = tmp_path / "guarded.toml"
-    path.write_text(configured(shown(), connect=[f"tls/127.0.0.1:{port}"]).replace('''
+    path.write_text(configured(verbs.shown(), connect=[f"tls/127.0.0.1:{port}"]).replace('''
 [[node]]
 name = "base"
 actor = "tests.actors.ros2.robot:Base"
@@ -56,13 +48,13 @@ def in_ros2(run):
 
 def test_the_gateway_passes_and_finds_each_new_router(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    port = ports()
+    port = verbs.ports()
     path = written(tmp_path, port + 1)
-    settings = secured(tmp_path, port)
+    settings = verbs.secured(tmp_path, port)
     with RealRun(tmp_path, path) as run:
         wait_until(lambda: run.story.count(LOST) == 1, 20)
         for number in (1, 2):
-            with Robot(port, router=settings) as robot:
+            with verbs.Robot(port, router=settings) as robot:
                 wait_until(lambda robot=robot: robot.heard > 20, 20)
                 wait_until(lambda: "linked, 2 nodes" in in_ros2(run), 20)
                 wait_until(lambda number=number: run.story.count(BACK) == number, 20)
@@ -88,7 +80,7 @@ def only(listed):
         "rules": [{"id": name, "messages": messages, "flows": ["ingress", "egress"],
                    "permission": "allow", "key_exprs": keys}
                   for name, (messages, keys) in listed.items()] + [
-                      {"id": "all", "messages": EVERYTHING, "flows": ["ingress", "egress"],
+                      {"id": "all", "messages": verbs.EVERYTHING, "flows": ["ingress", "egress"],
                        "permission": "allow", "key_exprs": ["**", "@ros2_lv/**", "**/@adv/**"]}],
         "subjects": [{"id": "gateway", "cert_common_names": ["gateway"]},
                      {"id": "own", "link_protocols": ["tcp"]}],
@@ -98,10 +90,10 @@ def only(listed):
 
 @pytest.mark.parametrize("listed", [LISTED, {"graph": LISTED["graph"]}], ids=["all", "graph"])
 async def test_the_listed_rules_are_enough_and_needed(tmp_path, listed):
-    port = ports()
-    make_credentials(tmp_path)
+    port = verbs.ports()
+    verbs.make_credentials(tmp_path)
     loop, types, got = asyncio.get_running_loop(), Types("jazzy"), set()
-    with opened({**secured(tmp_path, port), **only(listed)}):
+    with verbs.opened({**verbs.secured(tmp_path, port), **only(listed)}):
         side = ZenohSide([f"tcp/127.0.0.1:{port}"], loop, mode="peer")
         robot = RosNode(side, types, "base", wall_ns=time.time_ns, refuse=lambda *_: None)
         pem = str(tmp_path / "robot-gateway.pem")

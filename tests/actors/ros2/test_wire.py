@@ -6,22 +6,11 @@ import time
 import msgspec
 import pytest
 
+from rampart.actors.ros2 import wire
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import ZenohSide, recorded_key
 from rampart.actors.ros2.translation.types import Types
-from rampart.actors.ros2.wire import (
-    MOST_TOKENS,
-    Attachment,
-    Endpoint,
-    EndpointKind,
-    Qos,
-    RosGraph,
-    data_key,
-    dds_name,
-    gid_of,
-    misfits,
-    ros_name,
-)
+from rampart.actors.ros2.wire import Endpoint, EndpointKind, Qos
 
 CAPTURED = ("@ros2_lv/0/9ca0f8facf84ffb1e6bfa4f2500889f0/0/3/MP/%/%/_ros2cli_712/%chatter/"
             "std_msgs::msg::dds_::String_/TypeHashNotSupported/:1:,1:,:,:,,")
@@ -38,7 +27,7 @@ def test_a_captured_token_is_read_and_written_the_same():
 
 
 def test_the_gid_of_a_captured_attachment_is_that_of_the_captured_token():
-    attachment = Attachment.unpack(ATTACHED)
+    attachment = wire.Attachment.unpack(ATTACHED)
     assert attachment.gid == Endpoint.parse(CAPTURED).gid
     assert attachment.sequence == 216
     assert attachment.pack() == ATTACHED
@@ -49,10 +38,10 @@ def test_nodes_in_namespaces_and_keys():
     assert node.token == "@ros2_lv/7/ab/1/1/NN/%/%robot%front/amcl"
     assert Endpoint.parse(node.token) == node
     assert node.full_name == "/robot/front/amcl"
-    assert data_key(7, "/a/b/", dds_name("nav_msgs/msg/Path"), "RIHS01_0") == (
+    assert wire.data_key(7, "/a/b/", wire.dds_name("nav_msgs/msg/Path"), "RIHS01_0") == (
         "7/a/b/nav_msgs::msg::dds_::Path_/RIHS01_0")
-    assert ros_name("std_srvs::srv::dds_::Trigger_") == "std_srvs/srv/Trigger"
-    assert ros_name("what") == "what"
+    assert wire.ros_name("std_srvs::srv::dds_::Trigger_") == "std_srvs/srv/Trigger"
+    assert wire.ros_name("what") == "what"
     for qos, text in ((Qos(), "::,:,:,:,,"), (Qos(reliable=False, depth=7), "2::,7:,:,:,,"),
                       (Qos(transient_local=True, keep_all=True, depth=5), ":1:2,5:,:,:,,")):
         assert (qos.token(), Qos.parse(text)) == (text, qos)
@@ -61,7 +50,7 @@ def test_nodes_in_namespaces_and_keys():
 @pytest.mark.parametrize("token", [
     CAPTURED, f"{CAPTURED}/more", CAPTURED.replace(":1:,1:,:,:,,", ":1:,1:2,0:,:,,")])
 def test_the_graph_knows_an_endpoint_by_the_id_of_its_whole_token(token):
-    graph, gid = RosGraph(), gid_of(token)
+    graph, gid = wire.RosGraph(), wire.gid_of(token)
     graph.changed(token, True)
     assert graph.endpoint(gid).node == "_ros2cli_712"
     graph.changed(token, False)
@@ -82,7 +71,7 @@ def test_what_is_no_token_is_one_line(token):
                                   ATTACHED[:16] + b"\x11" + ATTACHED[17:]])
 def test_what_is_no_attachment_is_one_line(data):
     with pytest.raises(ValueError, match="attachment"):
-        Attachment.unpack(data)
+        wire.Attachment.unpack(data)
 
 
 def endpoint(kind, node="a", **what):
@@ -99,22 +88,22 @@ def endpoint(kind, node="a", **what):
     (endpoint(EndpointKind.PUBLISHER, "b", qos=Qos(reliable=False)), "offers best effort")])
 def test_who_cannot_meet_is_told(there, words):
     mine = endpoint(EndpointKind.SUBSCRIPTION, qos=Qos(transient_local=True))
-    assert "keeps none" in next(misfits([mine], [endpoint(EndpointKind.PUBLISHER, "b")]))
-    found = list(misfits([endpoint(EndpointKind.SUBSCRIPTION)], [there]))
+    assert "keeps none" in next(wire.misfits([mine], [endpoint(EndpointKind.PUBLISHER, "b")]))
+    found = list(wire.misfits([endpoint(EndpointKind.SUBSCRIPTION)], [there]))
     assert [words in one for one in found] == ([True] if words else [])
 
 
 def test_the_graph_is_bounded_and_forgets_who_has_gone():
-    graph = RosGraph()
+    graph = wire.RosGraph()
     assert graph.changed(CAPTURED, True).node == "_ros2cli_712"
     assert graph.changed(CAPTURED, True) is None
     assert graph.changed(CAPTURED, False) is not None
     assert graph.changed(CAPTURED, False) is None
-    for number in range(MOST_TOKENS):
+    for number in range(wire.MOST_TOKENS):
         graph.changed(f"@ros2_lv/0/a/{number}/{number}/NN/%/%/n", True)
     with pytest.raises(ValueError, match="more than"):
         graph.changed(CAPTURED, True)
-    assert graph.nodes() == {"/n": MOST_TOKENS}
+    assert graph.nodes() == {"/n": wire.MOST_TOKENS}
 
 
 async def test_what_a_node_says_and_hears_is_handed_to_the_recorder_as_it_travelled():
@@ -129,5 +118,5 @@ async def test_what_a_node_says_and_hears_is_handed_to_the_recorder_as_it_travel
             say(payload)
             await asyncio.sleep(0.02)
     side.close()
-    key = recorded_key(data_key(0, "/cmd_vel", dds_name(twist), types.hash(twist)))
+    key = recorded_key(wire.data_key(0, "/cmd_vel", wire.dds_name(twist), types.hash(twist)))
     assert {(where, msgspec.msgpack.decode(one)[0]) for where, one in taken} == {(key, payload)}
