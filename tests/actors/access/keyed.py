@@ -1,6 +1,5 @@
 """A router with keys in the process of a test, sessions by any certificate, what they achieve."""
 
-import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -46,15 +45,6 @@ def covered(keys: Iterable[str], expressions: Iterable[str]) -> set[str]:
             if any(one.includes(zenoh.KeyExpr(f"rampart/{key}")) for one in wanted)}
 
 
-@contextlib.contextmanager
-def opened(config: zenoh.Config):
-    session = zenoh.open(config)
-    try:
-        yield session
-    finally:
-        session.close()
-
-
 class Keyed:
     """A router, and by whose certificate what can be done there."""
 
@@ -80,4 +70,4 @@ class Keyed:
             one.close()
 
     def joined(self, name: str, credentials: Credentials | None = None):
-        return opened(session_config((), [self.socket], credentials or self.shown(name)))
+        return zenoh.open(session_config((), [self.socket], credentials or self.shown(name)))

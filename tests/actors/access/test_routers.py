@@ -18,7 +18,7 @@ from rampart.actors.bus.topics import INJECT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
 from rampart.testing import free_port, wait_until
-from tests.actors.access.keyed import Keyed, covered, every_key, layout_of, make_keys, opened
+from tests.actors.access.keyed import Keyed, covered, every_key, layout_of, make_keys
 from tests.two_hosts import two_hosts
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
@@ -163,7 +163,7 @@ def gets_through(keyed, config):
         held = viewer.declare_subscriber("rampart/**", lambda s: seen.append(
             s.key_expr) if s.payload.to_bytes() == b"stranger" else None)
         try:
-            with opened(config) as session:
+            with zenoh.open(config) as session:
                 own = [session.declare_subscriber(key, lambda s: heard.append(
                     s.key_expr) if s.payload.to_bytes() != b"stranger" else None)
                     for key in ("**", "rampart/control/command")]
@@ -218,7 +218,7 @@ def test_a_node_cannot_pose_as_a_router(keyed, folder):
     own = keyed.shown("DM4")
     socket = f"unixsock-stream/{folder}/router_b"
     there = Credentials(own.authority, own.own, {socket: "tls/127.0.0.1:9499"})
-    with opened(session_config([socket], [], there)):
+    with zenoh.open(session_config([socket], [], there)):
         victim = keyed.shown("safety_pilot")
         with pytest.raises(zenoh.ZError):
             zenoh.open(session_config((), ["tls/127.0.0.1:9499"], victim))
@@ -246,7 +246,7 @@ def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(tmp_path, 
         held = everybody.declare_subscriber("rampart/**", lambda s: got.append(str(s.key_expr)))
         taken = credentials_in(str(keys), "router_a_ground")
         at = f"tls/127.0.0.1:{free_port()}"
-        with opened(session_config([at], [robot.at], taken)) as ground:
+        with zenoh.open(session_config([at], [robot.at], taken)) as ground:
             def arrived():
                 for key in forged:
                     ground.put(f"rampart/{key}", "forged")
