@@ -39,16 +39,6 @@ from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
 from tests.virtual_time import within
 
 
-def noted(monitor: Sustained):
-    def handle(event: str, now_s: float) -> None:
-        if event == "?":
-            monitor.doubt()
-        else:
-            monitor.note("wrong" if event == "w" else "", now_s)
-
-    return handle
-
-
 # g: no error, w: error, ?: unknown; error for 300 ms, none for 200 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
     "wrong for long enough": ("gwwwwgggg", "----AAA--"),
@@ -60,7 +50,14 @@ def noted(monitor: Sustained):
 }))
 def test_what_lasts(events, expected):
     monitor = Sustained(0.3, 0.2)
-    assert play(monitor, noted(monitor), events) == expected
+
+    def handle(event, now_s):
+        if event == "?":
+            monitor.doubt()
+        else:
+            monitor.note("wrong" if event == "w" else "", now_s)
+
+    assert play(monitor, handle, events) == expected
 
 
 # m: a message. At least 10 Hz within 300 ms (3), at most 20 Hz (6).

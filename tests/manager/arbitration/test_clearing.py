@@ -125,15 +125,11 @@ def test_verification_covers_what_clears_and_finds_an_arbiter_that_clears_too_ea
         assert found.counterexamples[0][-1].endswith("is cleared")
 
 
-def full_with(name: str, clears: Clears):
-    return replace(full_system(), mechanisms=tuple(
-        replace(m, clears=clears) if m.name == name else m for m in full_system().mechanisms))
-
-
 @pytest.mark.parametrize("clears", [Clears.BY_OPERATOR, Clears.NEVER])
 def test_a_resumed_run_has_not_cleared(tmp_path, clears):
     """Its nodes have higher incarnations of the same checkpoints; its time is another one."""
-    spec = full_with("FTM13", clears)
+    spec = replace(full_system(), mechanisms=tuple(
+        replace(m, clears=clears) if m.name == "FTM13" else m for m in full_system().mechanisms))
 
     async def part(number: int, error: str = "", *, reset: bool = False):
         def manager(context: Context) -> FtmManager:
