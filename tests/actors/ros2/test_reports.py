@@ -90,18 +90,6 @@ def test_events_that_recur(count, events, expected):
     assert play(monitor, lambda _event, now_s: monitor.happened("it", now_s), events) == expected
 
 
-@pytest.mark.parametrize(("kind", "parameters", "words"), [
-    (LogMatch, {"matches": "(a"}, "matches = '(a': not a regular expression"),
-    (LogMatch, {"count": 0}, "count = 0"),
-    (ActionResult, {"results": ["failed"]}, "results[0] = 'failed'"),
-    (Diagnostics, {"status": ""}, "status"),
-])
-def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
-    with pytest.raises(ValueError, match=r"\A[^\n]+\Z") as caught:
-        read_parameters(kind.Parameters, {"topic": "a"} | parameters, "x.toml", "D.parameters")
-    assert words in str(caught.value)
-
-
 @pytest.mark.parametrize("kind", [Diagnostics, ActionResult, LogMatch])
 def test_the_reference_has_the_parameters_there_are(kind):
     text = (ROOT / "docs/reference/ros2.md").read_text(encoding="utf-8")
@@ -418,11 +406,16 @@ async def test_a_node_that_dies_while_it_is_configured_is_respawned_again(case):
     assert case.requests[-1].message.failed_incarnation == 2
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"lifecycle": ["other"]}, "lifecycle.*other: not among nodes"),
-    ({"ask": []}, "ask.*expected 1 entries"),
-    ({"state": ["a:b", "c:d"]}, "state.*expected 1 entries"),
-    ({"change": ["a", "b"]}, "change.*expected 1 entries")])
-def test_a_node_without_its_topics_is_refused(change, words):
-    with pytest.raises(ValueError, match=words):
-        read_parameters(RespawnLifecycle.Parameters, {**GIVEN, **change}, "x.toml", "R")
+@pytest.mark.parametrize(("kind", "parameters", "words"), [
+    (LogMatch, {"topic": "a", "matches": "(a"}, r"matches = '\(a': not a regular expression"),
+    (LogMatch, {"topic": "a", "count": 0}, "count = 0"),
+    (ActionResult, {"topic": "a", "results": ["failed"]}, r"results\[0\] = 'failed'"),
+    (Diagnostics, {"topic": "a", "status": ""}, "status"),
+    (RespawnLifecycle, {**GIVEN, "lifecycle": ["other"]}, "lifecycle.*other: not among nodes"),
+    (RespawnLifecycle, {**GIVEN, "ask": []}, "ask.*expected 1 entries"),
+    (RespawnLifecycle, {**GIVEN, "state": ["a:b", "c:d"]}, "state.*expected 1 entries"),
+    (RespawnLifecycle, {**GIVEN, "change": ["a", "b"]}, "change.*expected 1 entries")])
+def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        read_parameters(kind.Parameters, parameters, "x.toml", "D.parameters")
+    assert "\n" not in str(caught.value)

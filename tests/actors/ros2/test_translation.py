@@ -215,11 +215,19 @@ WRONG = [
     (lambda: said(TWIST, Twist, fields={"linear.x": "speed"}), "Twist has no field 'speed'"),
     (lambda: said(TWIST, Twist, fields={"linear": "linear_mps"}), "expected one of its fields"),
     (lambda: said(TWIST, Twist, fields={"linear.w": "linear_mps"}), "has no field 'w'"),
+    (lambda: Expression("east(latitude, longitude)"), "needs a datum"),
+    (lambda: Expression("axes[7]").read(MESSAGE), "axes[7]: the list has 3 items"),
+    *((lambda text=text: Expression(text, PLANE), why) for text, why in (
+        ("", "expected a field"), ("angle * x", "expected a number"),
+        ("jaw(pose)", "no function 'jaw'; known: yaw, quaternion, sqrt"),
+        ("yaw(a, b)", "yaw takes 1 field"), ("east(latitude)", "east takes 2 fields"),
+        ("pose..x", "is not a field"), ("axes[x]", "is not a field"), ("a b", "expected a field"),
+        ("yaw(axes[one])", "'axes[one]' is not a field"))),
 ]
 
 
 @pytest.mark.parametrize(("make", "why"), WRONG)
-def test_a_table_that_makes_no_sense_is_refused_in_one_line(make, why):
+def test_a_table_or_expression_that_makes_no_sense_is_refused_in_one_line(make, why):
     with pytest.raises(ValueError, match=r"[^\n]+") as raised:
         make()
     assert why in str(raised.value)
@@ -397,26 +405,3 @@ def test_what_is_no_number_is_none(text):
 @pytest.mark.parametrize("x", [0.0, 0.7, 2.0])
 def test_what_is_no_rotation_has_no_heading(x):
     assert math.isnan(yaw(Quaternion(x, 0.0, 0.0, 0.0))) is (x != 1.0)
-
-
-@pytest.mark.parametrize(("text", "why"), [
-    ("", "expected a field"), ("angle * x", "expected a number"),
-    ("jaw(pose)", "no function 'jaw'; known: yaw, quaternion, sqrt"),
-    ("yaw(a, b)", "yaw takes 1 field"), ("east(latitude)", "east takes 2 fields"),
-    ("pose..x", "is not a field"), ("axes[x]", "is not a field"), ("a b", "expected a field"),
-    ("yaw(axes[one])", "'axes[one]' is not a field")])
-def test_what_makes_no_sense_is_one_line(text, why):
-    with pytest.raises(ValueError, match=r"[^\n]+") as raised:
-        Expression(text, PLANE)
-    assert why in str(raised.value)
-    assert "\n" not in str(raised.value)
-
-
-def test_the_globe_needs_a_datum():
-    with pytest.raises(ValueError, match="needs a datum"):
-        Expression("east(latitude, longitude)")
-
-
-def test_an_item_that_is_not_there_is_an_error():
-    with pytest.raises(ValueError, match=r"axes\[7\]: the list has 3 items"):
-        Expression("axes[7]").read(MESSAGE)
