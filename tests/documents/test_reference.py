@@ -33,7 +33,7 @@ from rampart.manager.spec.schema import (
     SystemSpec,
     Timing,
 )
-from rampart.manager.spec.specification import SpecificationError, parse_specification
+from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import End
 from rampart.testing import virtual_run
 from tests import ROOT, TANK
@@ -84,24 +84,6 @@ def test_the_table_has_every_field_with_its_default(heading, tables):
         if tables == (SystemSpec,) and isinstance(default, tuple | dict):  # tables
             written = ""
         assert rows[name] == f"`{written}`" if written else "`" not in rows[name], name
-
-
-def test_the_least_that_is_a_system_is_what_the_document_says():
-    text = """name = "x"\ntitle = "x"
-[[node]]\nname = "m"\nactor = "rampart.manager.actor:FtmManager"\nkind = "manager"
-[[detection]]\nname = "D"\ntitle = "D"\nactor = "a.b:C"\nwithin_s = 0.1
-[[recovery]]\nname = "R"\ntitle = "R"\nactor = "a.b:C"\nkind = "forward"
-[[mechanism]]\nname = "M"\ndetect = "D"\nrecover = "R"\nevent = "e"
-against = { within_s = 5.0, hazard = "h" }
-[[event]]\nname = "e"
-[orders.safer]\n"""
-    parse_specification(text, "x.toml")
-    for table in ("node", "event"):
-        without = re.sub(rf"(?m)^\[\[{table}\]\]\n(\w.*\n)*", "", text)
-        with pytest.raises(SpecificationError):
-            parse_specification(without, "x.toml")
-    with pytest.raises(SpecificationError, match="unknown order"):
-        parse_specification(text.replace("[orders.safer]\n", ""), "x.toml")
 
 
 def test_the_worked_example_is_a_sound_system(tmp_path, capsys):
