@@ -8,8 +8,6 @@ from functools import partial
 
 import pytest
 
-from rampart.actors.bus import topics
-from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.runtime.actor import Actor, every
 from rampart.testing import VirtualSystem, eventually, play, run, virtual_run, wait_until, wake
 from tests import CELL
@@ -40,24 +38,6 @@ def test_what_an_actor_raised_fails_the_test_unless_it_was_killed_or_the_test_it
     run(partial(living, "kill"))
     with pytest.raises(KeyError, match="the test"):
         run(partial(living, error=KeyError("the test")))
-
-
-def test_one_hears_what_nodes_say_and_forgeries_are_rejected():
-    async def scenario():
-        async with VirtualSystem() as system:
-            beats = system.hear(topics.HEARTBEAT, "quiet")
-            system.start("quiet", Actor)
-            await asyncio.sleep(1.0)
-            await system.kill("quiet")
-            system.start("quiet", Actor)
-            await asyncio.sleep(1.0)
-            system.say(topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "quiet", incarnation=7)
-            await system.settle()
-            return [heard.header.incarnation for heard in beats]
-
-    incarnations = run(scenario)
-    assert incarnations == sorted(incarnations)
-    assert set(incarnations) == {1, 2, 7}
 
 
 def test_a_node_that_no_file_has_is_named():
