@@ -47,8 +47,6 @@ AIRPORTS = {
     "a name that steers the terminal": (edited(
         'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
-    "a fault that lies deeper than the next node has values": (
-        edited("S = [0.0, 0.0]\nT = [30.0, 0.0]", "S = [0.0, []]\nT = [0.0]"), "nodes.S[1]: []"),
 }
 
 
