@@ -19,12 +19,6 @@ from rampart.testing import RealRun, virtual_run
 from tests import ROOT
 
 
-@pytest.fixture(autouse=True)
-def _a_path_of_its_own(monkeypatch):
-    """`rampart` admits the working folder, and a robot that another test has made lies there."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes()
             for file in sorted(folder.rglob("*")) if file.is_file()}

@@ -17,6 +17,7 @@ from rampart.testing import RealRun, free_base_port
 from tests import CELL, ROOT, TANK
 from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.web.pems import pair
+from tests.documents.page import Page
 from tests.two_hosts import two_hosts
 
 SHORT = ["--virtual", "--system", str(CELL), "--duration", "1"]
@@ -66,18 +67,8 @@ def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
 NO_OPTION = "not an option of the launcher or of tank; --system tank.toml --help lists the options"
 OF_TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
 GROUND = [*TWO, "--host", "ground"]
-LINK = (ROOT / "systems/osmosis.toml").read_text() + """
-[[node]]
-name = "link"
-actor = "rampart.actors.foreign.velocity_link:VelocityLink"
-kind = "non-control"
-respawn = "supervisor"
-
-[node.parameters]
-socket = "/run/robot/stop"
-linear = "summit_xl/command:linear_mps"
-angular = "summit_xl/command:angular_radps"
-"""
+OSMOSIS = ROOT / "systems/osmosis.toml"
+LINK = Page("how-to/zero-velocity").block("toml").replace("guard/velocity", "summit_xl/command")
 FOR_ALL = ["--hmi-host", "0.0.0.0"]
 TOKEN = "secret-of-the-hangar-7"
 REFUSED = [
@@ -92,7 +83,7 @@ REFUSED = [
     (["--rate", "0"], "--rate 0"),
     (["--system", "osmosis-ros2", "--rate", "0.5"],
      "--rate 0.5: expected 1: node gateway exchanges messages with a robot on the wall clock, and"),
-    (["--system", "link.toml", "--rate", "4"], "--rate 4: expected 1: node link exchanges"),
+    (["--system", "link.toml", "--rate", "4"], "--rate 4: expected 1: node velocity_link"),
     (["--obstacles", "-1"], "--obstacles -1"),
     (["--port", "80"], "--port 80"),
     (["--patience", "nan"], "nan"),
@@ -150,7 +141,7 @@ def test_bad_usage_is_one_clear_line_and_exit_code_2(
         tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tank.toml").write_text(TANK)
-    (tmp_path / "link.toml").write_text(LINK)
+    (tmp_path / "link.toml").write_text(f"{OSMOSIS.read_text()}\n{LINK}")
     (tmp_path / "two.toml").write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}))
     (tmp_path / "far.miss").write_text("x=-22,y=-18.5,taxi=1\nx=500,y=0,taxi=0\n")
     (tmp_path / "far.miss").chmod(0o644)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import sys
 from itertools import takewhile
 from pathlib import Path
 
@@ -135,8 +134,6 @@ def test_a_velocity_beyond_the_limits_is_refused_between_guard_and_gateway(
         tmp_path, monkeypatch, field):
     write_guard(tmp_path / "guarded")
     monkeypatch.syspath_prepend(tmp_path / "guarded")
-    for module in ("guard", "robot"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
 
     async def scenario() -> None:
         async with VirtualSystem.load(tmp_path / "guarded/guarded.toml") as system:

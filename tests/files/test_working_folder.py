@@ -15,7 +15,6 @@ from tests.documents.page import Page
     (0o755, ""), (0o757, "others can write"), (0o1777, "others can write")])
 def test_a_folder_that_others_can_write_is_not_searched(tmp_path, monkeypatch, mode, why):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
     tmp_path.chmod(mode)
     working_folder.admit()
     assert (sys.path[-1] == str(tmp_path)) is not bool(why)

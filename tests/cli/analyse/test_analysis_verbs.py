@@ -26,6 +26,12 @@ TEXT = CELL.read_text(encoding="utf-8")
 CAMERA = 'name = "camera"\nactor = "rampart.actors.runtime.stub_node:StubNode"'
 
 
+@pytest.fixture(autouse=True)
+def _the_papers_system(monkeypatch):
+    """Its decisions are known by heart; the full system's are judged elsewhere."""
+    monkeypatch.setattr(systems, "DEFAULT", SHIPPED / "paper.toml")
+
+
 def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
     assert main(arguments) == code
     return tuple(capsys.readouterr())
@@ -150,12 +156,6 @@ def test_a_doubtful_file_is_analysed_with_a_warning(capsys, tmp_path):
     (line,) = err.splitlines()
     assert f"{file}:2: " in line
     assert "pmup" in line
-
-
-@pytest.fixture(autouse=True)
-def _the_papers_system(monkeypatch):
-    """Its decisions are known by heart; the full system's are judged elsewhere."""
-    monkeypatch.setattr(systems, "DEFAULT", SHIPPED / "paper.toml")
 
 
 def graph(edges, **boxes) -> Diagram:
