@@ -1,4 +1,7 @@
-"""A small recording, and a port for a run."""
+"""A small recording, a port for a run, and what stands for its launcher."""
+
+import subprocess
+import sys
 
 import pytest
 
@@ -16,3 +19,11 @@ def recording(tmp_path):
 @pytest.fixture
 def port():
     return free_base_port()
+
+
+@pytest.fixture
+def launcher():
+    """A process that may be killed for a launcher; it has no run."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        yield process
+        process.kill()

@@ -5,8 +5,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -33,7 +31,7 @@ from rampart.cli.record.incident_verbs import names
 from rampart.cli.run import _black_box, black_box_folder
 from rampart.cli.run_options import parse
 from rampart.manager.spec.tables import BlackBox as Limits
-from rampart.testing import RealRun, free_base_port, wait_until
+from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.recording.samples import AnsweringLauncher, documents, pid_of, pose
 from tests.osmosis_system import shipped_system
@@ -300,22 +298,10 @@ def boxes():
     return found
 
 
-@pytest.fixture
-def launcher(tmp_path):
-    """A black box of a process that stands for a launcher; it has no run."""
-    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-
-    def box(folder):
-        return RecorderProcess(Order(free_base_port(), str(folder), process.pid, black_box=LIMITS))
-
-    yield box
-    with process:
-        process.kill()
-
-
-def test_a_killed_black_box_is_started_again_to_continue_its_ring(launcher, tmp_path, monkeypatch):
+def test_a_killed_black_box_is_started_again_to_continue_its_ring(
+        launcher, port, tmp_path, monkeypatch):
     monkeypatch.setattr("rampart.actors.recording.process._AGAIN_S", 0.0)
-    box = launcher(tmp_path / "paper")
+    box = RecorderProcess(Order(port, str(tmp_path / "paper"), launcher.pid, black_box=LIMITS))
     box.start()
     [killed] = boxes()
     os.kill(killed, signal.SIGKILL)
@@ -327,10 +313,11 @@ def test_a_killed_black_box_is_started_again_to_continue_its_ring(launcher, tmp_
     box.end()
 
 
-def test_a_folder_that_cannot_be_made_ends_it_with_one_line(launcher, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_made_ends_it_with_one_line(launcher, port, tmp_path):
     (tmp_path / "file").write_text("")
-    box = launcher(tmp_path / "file" / "paper")
-    with AnsweringLauncher(box._order.port, time.monotonic(), box._order.launcher):
+    folder = str(tmp_path / "file" / "paper")
+    box = RecorderProcess(Order(port, folder, launcher.pid, black_box=LIMITS))
+    with AnsweringLauncher(port, time.monotonic(), launcher.pid):
         box.start()
         wait_until(box.keep_alive, 30, "it does not end")
     assert re.fullmatch(r"[^\n]*Not a directory[^\n]*", box.keep_alive())

@@ -50,16 +50,6 @@ def numbers(path):
 
 
 @pytest.fixture
-def launcher():
-    """A process that may be killed for a launcher."""
-    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    yield process
-    process.kill()
-    process.wait()
-    process.stdin.close()
-
-
-@pytest.fixture
 def dead():
     """The number of a process that has ended."""
     process = subprocess.Popen(["true"])
