@@ -12,18 +12,8 @@ from msgspec import structs
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Injection
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    Goal,
-    Imu,
-    LaserScan,
-    MissionRequest,
-    Mode,
-    Odometry,
-    Pose,
-    Route,
-    Twist,
-)
 from rampart.actors.runtime.actor import Actor, every
 from rampart.actors.runtime.corruption import wrap
 from rampart.actors.runtime.injection import FaultGate, flaw
@@ -31,8 +21,8 @@ from tests.osmosis_system import System
 from tests.virtual_time import within
 
 KEY = "rampart/localization/pose"
-POSE = Pose(1.0, 2.0, 0.5)
-ROUTE = Route("m", 0, Mode.TAXI, True, ((0.0, 0.0), (1.0, 5.0), (9.0, 9.0)), "")
+POSE = m.Pose(1.0, 2.0, 0.5)
+ROUTE = m.Route("m", 0, m.Mode.TAXI, True, ((0.0, 0.0), (1.0, 5.0), (9.0, 9.0)), "")
 
 
 def gate(mode: str, topic: str = "localization/pose", **fields: object) -> FaultGate:
@@ -54,7 +44,7 @@ def sent(faults: FaultGate, times_s) -> list[tuple[float, float, float, int] | N
     """Publish a pose with x = time at each time; return (x, stamp, delay, copies) of each."""
     found = []
     for t in times_s:
-        out = faults.apply(KEY, Pose(t, 0.0, 0.0), t, t)
+        out = faults.apply(KEY, m.Pose(t, 0.0, 0.0), t, t)
         if out is not None:
             faults.last[KEY] = (out.body, out.stamp)
         found.append(out and (out.body.x_m, out.stamp, out.delay_s, out.copies))
@@ -81,7 +71,7 @@ def test_each_mode_changes_what_it_says_and_nothing_else(mode, fields, at_12, at
     assert sent(faults, [10.0, 11.0]) == [(10.0, 10.0, 0.0, 1), (11.0, 11.0, 0.0, 1)]
     assert faults.order(Injection("i", "localization/pose", mode, 5.0, **fields), 11.5) == ""
     assert sent(faults, [12.0, 13.0]) == [at_12, at_13]
-    goal = Goal(0.0, 0.0, Mode.TAXI)
+    goal = m.Goal(0.0, 0.0, m.Mode.TAXI)
     assert faults.apply("rampart/mission/goal", goal, 13.5, 13.5).body is goal
     assert faults.expire("i") == 2
     assert sent(faults, [14.0]) == [(14.0, 14.0, 0.0, 1)]
@@ -157,14 +147,14 @@ def test_noise_has_the_spread_it_was_ordered_with_and_comes_from_the_seed():
 
 
 @pytest.mark.parametrize(("body", "fields", "expected"), [
-    (Odometry(POSE, Twist(0.5, 0.0)), {"set_fields": {"pose.x_m": 7.0}},
-     Odometry(Pose(7.0, 2.0, 0.5), Twist(0.5, 0.0))),
-    (MissionRequest("m", "", (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))),
+    (m.Odometry(POSE, m.Twist(0.5, 0.0)), {"set_fields": {"pose.x_m": 7.0}},
+     m.Odometry(m.Pose(7.0, 2.0, 0.5), m.Twist(0.5, 0.0))),
+    (m.MissionRequest("m", "", (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))),
      {"add_fields": {"goals.x_m": 10.0}},
-     MissionRequest("m", "", (Goal(11.0, 2.0, Mode.TAXI), Goal(13.0, 4.0, Mode.TAXI)))),
-    (Imu(3.0, 0.0, 0.0, 0.0), {"add_fields": {"yaw_rad": 1.0}}, Imu(wrap(4.0), 0.0, 0.0, 0.0)),
+     m.MissionRequest("m", "", (m.Goal(11.0, 2.0, m.Mode.TAXI), m.Goal(13.0, 4.0, m.Mode.TAXI)))),
+    (m.Imu(3.0, 0.0, 0.0, 0.0), {"add_fields": {"yaw_rad": 1.0}}, m.Imu(wrap(4.0), 0.0, 0.0, 0.0)),
     (ROUTE, {"set_fields": {"mode": "light verification", "active": False}},
-     structs.replace(ROUTE, mode=Mode.LIGHT_VERIFICATION, active=False)),
+     structs.replace(ROUTE, mode=m.Mode.LIGHT_VERIFICATION, active=False)),
     (ROUTE, {"keep_ends": ("waypoints",)},
      structs.replace(ROUTE, waypoints=((0.0, 0.0), (9.0, 9.0)))),
     (ROUTE, {"add_fields": {"waypoints": 1.0, "step": 2.0}},
@@ -174,11 +164,11 @@ def test_a_field_is_found_by_its_path_through_structs_and_sequences(body, fields
     assert corrupted(body, **fields) == expected
 
 
-def scan(ranges) -> LaserScan:
-    return LaserScan(-1.0, 0.1, 8.0, np.asarray(ranges, dtype="<f4").tobytes())
+def scan(ranges) -> m.LaserScan:
+    return m.LaserScan(-1.0, 0.1, 8.0, np.asarray(ranges, dtype="<f4").tobytes())
 
 
-def ranges(body: LaserScan) -> np.ndarray:
+def ranges(body: m.LaserScan) -> np.ndarray:
     return np.frombuffer(body.ranges_f32, dtype="<f4")
 
 
@@ -265,20 +255,20 @@ def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode,
     order = Injection(**{"injection": "i", "topic": "summit_xl/odom", "mode": mode,
                          "duration_s": 1.0, **fields})
     faults = FaultGate()
-    reason = faults.order(order, 0.0, Odometry)
+    reason = faults.order(order, 0.0, m.Odometry)
     assert words in reason
     assert "\n" not in reason
-    body = Odometry(POSE, Twist(0.5, 0.0))
+    body = m.Odometry(POSE, m.Twist(0.5, 0.0))
     assert faults.apply(f"rampart/{order.topic}", body, 0.0, 0.0).body is body
 
 
 @pytest.mark.parametrize(("kind", "fields", "fits"), [
-    (LaserScan, {"set_fields": {"ranges_f32": b"1234"}}, True),
-    (LaserScan, {"set_fields": {"ranges_f32": True}}, False),
-    (Route, {"add_fields": {"step": 1.0}}, True),
-    (Route, {"ramp_fields": {"step": 1.0}}, False),
-    (Route, {"add_fields": {"active": 1.0}}, False),
-    (Route, {"noise_fields": {"waypoints": 1.0}}, True),
+    (m.LaserScan, {"set_fields": {"ranges_f32": b"1234"}}, True),
+    (m.LaserScan, {"set_fields": {"ranges_f32": True}}, False),
+    (m.Route, {"add_fields": {"step": 1.0}}, True),
+    (m.Route, {"ramp_fields": {"step": 1.0}}, False),
+    (m.Route, {"add_fields": {"active": 1.0}}, False),
+    (m.Route, {"noise_fields": {"waypoints": 1.0}}, True),
 ])
 def test_whether_a_change_fits_is_known_from_the_type_of_the_field(kind, fields, fits):
     assert (flaw(Injection("i", "t", "corrupt", 1.0, **fields), kind) == "") == fits
@@ -287,7 +277,7 @@ def test_whether_a_change_fits_is_known_from_the_type_of_the_field(kind, fields,
 @pytest.mark.parametrize(("fields", "body", "words"), [
     ({"set_fields": {"z_m": 1.0}}, POSE, "'z_m': unknown"),
     ({"set_fields": {"x_m": "far"}}, POSE, "corrupt Pose"),
-    ({"add_fields": {"ranges_f32": 1.0}}, LaserScan(0.0, 0.1, 8.0, b"12345"), "5 bytes"),
+    ({"add_fields": {"ranges_f32": 1.0}}, m.LaserScan(0.0, 0.1, 8.0, b"12345"), "5 bytes"),
     ({"add_fields": {"reason": 1.0}}, ROUTE, "got str"),
 ])
 def test_a_misfit_that_only_the_message_shows_ends_the_injection_and_leaves_the_message(
@@ -317,7 +307,7 @@ class Talker(Actor):
     @every(0.1)
     def speak(self) -> None:
         self.said += 1
-        self.publish(topics.POSE, Pose(float(self.said), 0.0, 0.0))
+        self.publish(topics.POSE, m.Pose(float(self.said), 0.0, 0.0))
 
 
 class Scene(System):
@@ -377,7 +367,7 @@ async def test_a_fault_that_fails_when_it_is_ordered_or_on_its_first_message_has
 
         @every(0.1)
         def speak(self) -> None:
-            self.publish(topics.SCAN, LaserScan(0.0, 0.1, 8.0, b"12345"))
+            self.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b"12345"))
 
     scene.start("broken", Broken)
     await scene.settle()

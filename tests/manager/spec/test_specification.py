@@ -16,14 +16,8 @@ from rampart.actors.foreign.program import check_programs
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.layout import Layout
+from rampart.manager.spec import mobile_robot
 from rampart.manager.spec.budget import check, find_false_alarms
-from rampart.manager.spec.mobile_robot import (
-    derive_timeouts,
-    time_to_drift_s,
-    time_to_intrusion_s,
-    time_to_obstacle_s,
-    time_to_runaway_s,
-)
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import check_change
 from rampart.manager.spec.tables import Timing
@@ -444,16 +438,17 @@ def drive_m(robot, waiting_s: float, acceleration_mps2: float) -> float:
 def test_who_waits_as_long_as_it_may_stops_right_at_the_edge(speed, accel, brake, clearance):
     robot = replace(ROBOT, top_speed_mps=speed, acceleration_mps2=accel, braking_mps2=brake,
                     corridor_clearance_m=clearance + speed ** 2 / (2 * brake))
-    for acceleration, waiting_s in ((accel, time_to_runaway_s(robot)),
-                                    (0.0, time_to_drift_s(robot))):
+    for acceleration, waiting_s in ((accel, mobile_robot.time_to_runaway_s(robot)),
+                                    (0.0, mobile_robot.time_to_drift_s(robot))):
         assert drive_m(robot, waiting_s, acceleration) == pytest.approx(
             robot.corridor_clearance_m, abs=5e-3)
 
 
 def test_a_robot_that_cannot_even_brake_in_its_corridor_has_no_time():
     robot = replace(ROBOT, corridor_clearance_m=0.2)
-    assert time_to_runaway_s(robot) == pytest.approx(time_to_drift_s(robot))
-    assert time_to_runaway_s(robot) < 0
+    time_s = mobile_robot.time_to_runaway_s(robot)
+    assert time_s == pytest.approx(mobile_robot.time_to_drift_s(robot))
+    assert time_s < 0
 
 
 def test_a_guard_that_is_switched_off_needs_no_time():
@@ -463,9 +458,9 @@ def test_a_guard_that_is_switched_off_needs_no_time():
 
 
 def test_the_numbers_of_the_shipped_robot():
-    assert time_to_drift_s(ROBOT) == pytest.approx(1.25)
-    assert time_to_obstacle_s(ROBOT) == pytest.approx(0.55)
-    assert time_to_intrusion_s(ROBOT, 0.6) == pytest.approx(0.3)
+    assert mobile_robot.time_to_drift_s(ROBOT) == pytest.approx(1.25)
+    assert mobile_robot.time_to_obstacle_s(ROBOT) == pytest.approx(0.55)
+    assert mobile_robot.time_to_intrusion_s(ROBOT, 0.6) == pytest.approx(0.3)
     timing = SPEC.timing
     assert (timing.command_timeout_s, timing.localization_timeout_s, timing.manager_timeout_s,
             timing.detection_silence_timeout_s, timing.scan_timeout_s, timing.dead_man_timeout_s,
@@ -475,9 +470,9 @@ def test_the_numbers_of_the_shipped_robot():
 def test_only_a_repair_pays_for_the_respawn_and_a_given_command_timeout_moves_the_heartbeat():
     assert {b.name: b.respawn_s for b in check(SPEC) if b.respawn_s} == {
         "FTM4": 0.4, "FTM5": 0.4, "FTM7": 0.4}
-    timing = derive_timeouts(ROBOT, replace(Timing(), command_timeout_s=0.9))
+    timing = mobile_robot.derive_timeouts(ROBOT, replace(Timing(), command_timeout_s=0.9))
     assert (timing.command_timeout_s, round(timing.heartbeat_timeout_s, 6)) == (0.9, 0.35)
-    timing = derive_timeouts(replace(ROBOT, corridor_clearance_m=20.0), Timing())
+    timing = mobile_robot.derive_timeouts(replace(ROBOT, corridor_clearance_m=20.0), Timing())
     assert timing.heartbeat_timeout_s == 0.5, "at most five periods"
 
 
@@ -487,7 +482,7 @@ def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance,
     """If there is time at all; otherwise they are so short that they are refused."""
     robot = replace(ROBOT, top_speed_mps=speed, braking_mps2=brake, stop_distance_m=stop,
                     corridor_clearance_m=clearance)
-    spec = replace(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
+    spec = replace(SPEC, mobile=robot, timing=mobile_robot.derive_timeouts(robot, Timing()))
     detections = tuple(
         replace(d, within_s=timeout_s, parameters=d.parameters | {"timeout_s": timeout_s})
         if "timeout_s" in d.parameters else d
