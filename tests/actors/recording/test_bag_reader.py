@@ -97,19 +97,11 @@ def test_a_damaged_attachment_is_left_out_and_reported(tmp_path, recording):
     assert [gap.what.split(" (")[0] for gap in reader.gaps] == ["attachment"]
 
 
-@pytest.fixture
-def torn(tmp_path, recording):
-    """A recording with one damaged chunk, and the index of that chunk."""
+def test_verbs_report_bytes_and_seconds_that_are_gone_and_exit_with_1(
+        tmp_path, recording, capsys):
     data, everything, chunks = recording
-    hit = chunks[2]
-    changed = bytearray(data)
-    changed[hit.chunk_start_offset + hit.chunk_length // 2] ^= 0xff
-    (tmp_path / "torn.mcap").write_bytes(changed)
-    return tmp_path / "torn.mcap", everything, hit
-
-
-def test_verbs_report_bytes_and_seconds_that_are_gone_and_exit_with_1(tmp_path, torn, capsys):
-    path, everything, hit = torn
+    hit, path = chunks[2], tmp_path / "torn.mcap"
+    spoiled(path, data, hit.chunk_start_offset + hit.chunk_length // 2, 0xff)
     assert main(["bag", "info", str(path), "--json"]) == 1
     [gone] = json.loads(capsys.readouterr().out)["gone"]
     assert (gone["from_byte"], gone["to_byte"]) == (
