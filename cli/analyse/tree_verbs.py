@@ -24,7 +24,7 @@ from rampart.cli.output import (
     using,
     warn,
 )
-from rampart.cli.verbs import JSON, add_verb, flag, option, whole, word
+from rampart.cli.verbs import JSON, add_verb, either, flag, option, whole, word
 from rampart.files.reading import read_bytes
 from rampart.manager.analysis.barriers import guard
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
@@ -79,13 +79,31 @@ def _words(box: Box, diagram: Diagram) -> list[str]:
     return list(filter(None, (name + gate, box.subtitle, barrier)))
 
 
+def to_dot(diagrams: Sequence[Diagram]) -> str:
+    """Return diagrams as one graph in the language DOT of Graphviz."""
+    lines = ["digraph {", "  node [shape=box]"]
+    for number, diagram in enumerate(diagrams):
+        ids = {box.name: f"b{number}_{place}" for place, box in enumerate(diagram.boxes)}
+        lines.append(f"  subgraph cluster_{number} {{ label={_quoted(diagram.title)}")
+        lines += (f"    {ids[box.name]} [label={_quoted(*_words(box, diagram))}]"
+                  for box in diagram.boxes)
+        lines += (f"    {ids[upper]} -> {ids[lower]}" for upper, lower in diagram.edges)
+        lines.append("  }")
+    return "\n".join((*lines, "}")) + "\n"
+
+
+def _quoted(*lines: str) -> str:
+    escaped = [line.replace("\\", "\\\\").replace('"', '\\"') for line in lines]
+    return '"' + "\\n".join(escaped) + '"'
+
+
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "tree", "draw fault tree, FTMTree and order of recoveries", show_tree,
              systems.choice(),
              option("--what", choices=(*WHATS, "all"), default="all",
                     help="which diagrams (default: all)"),
-             JSON)
+             either(flag("--dot", "print DOT, which Graphviz draws"), JSON))
     add_verb(verbs, "cut-sets", "find minimal cut sets and their barriers", cut_sets,
              systems.choice("file", ", or Open-PSA file .xml"),
              flag("--count", "print only the number of sets"),
@@ -104,7 +122,7 @@ def show_tree(options: argparse.Namespace) -> int:
     Examples:
       rampart tree
       rampart tree my_system.toml
-      rampart tree --what fault-tree > fault_tree.txt
+      rampart tree --what fault-tree --dot | dot -Tsvg > fault_tree.svg
       rampart tree --what order --json
     """
     spec = systems.load(options.system)
@@ -113,7 +131,7 @@ def show_tree(options: argparse.Namespace) -> int:
     if options.json:
         print_json(diagrams)
         return 0
-    text = to_text(diagrams)
+    text = to_dot(diagrams) if options.dot else to_text(diagrams)
     try:
         text.encode(sys.stdout.encoding or "utf-8")
     except UnicodeEncodeError:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import subprocess
+import xml.etree.ElementTree as ET
 from io import BytesIO, TextIOWrapper
 
 import msgspec
@@ -255,10 +257,16 @@ def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path):
     file = tmp_path / "hostile.toml"
     file.write_text(text.replace("[orders.safer]", f"[orders.{json.dumps(HOSTILE)}]"))
     tree = ["tree", "--system", str(file)]
-    shown = [said(capsys, *tree)[0], said(capsys, *tree, "--json")[0]]
+    shown = [said(capsys, *tree, *more)[0] for more in ((), ("--json",), ("--dot",))]
     assert not {"\x1b", "\x00", "\u202e"} & set("".join(shown))
     assert f"├── erroneous_graph  {one_line(HOSTILE)}" in shown[0].splitlines()
     assert len(json.loads(shown[1])) == 3
+    drawn = ET.fromstring(subprocess.run(
+        ("dot", "-Tsvg"), input=shown[2], capture_output=True, text=True, check=True).stdout)
+    assert not drawn.findall(".//{*}script")
+    assert one_line(HOSTILE) in {text.text for text in drawn.findall(".//{*}text")}
+    boxes = {box["name"] for diagram in json.loads(shown[1]) for box in diagram["boxes"]}
+    assert len(drawn.findall(".//{*}g[@class='node']")) >= len(boxes)
 
 
 CHAIN = [(f"e{i}", f"e{i + 1}") for i in range(999)]
