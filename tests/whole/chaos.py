@@ -19,8 +19,8 @@ A process of the pool is no node: any other one of the pool counts as its replac
 
 One line is printed for each strike or mission, and a summary. Exit code 1 if anything was not as it
 has to be: that ends a session. What is done is kept as lines of JSON, and the same command
-continues after an interruption. Other load on the machine is part of what is tested, so keep it
-moderate.
+continues after an interruption; strikes of a mission without a verdict are made again. Other load
+on the machine is part of what is tested, so keep it moderate.
 
 In the soak each process is killed once at first: a process of the pool that has replaced another
 has more memory of its own than those that were forked at the start, and after that step it counts
@@ -572,7 +572,9 @@ def session(log: Log, options: argparse.Namespace) -> None:
                 return
         else:
             plan = {"ways": each_in_every_way, "pairs": every_pair}[options.what]
-            strikes = plan(targets(spec), options.seed)[len(log.of("hit")):]
+            ended = {mission["mission"] for mission in log.of("mission")}
+            done = sum(hit["mission"] in ended for hit in log.of("hit"))
+            strikes = plan(targets(spec), options.seed)[done:]
             if not strikes:
                 return
             strikes = [replace(one, at_s=one.at_s - strikes[0].at_s) for one in strikes]
